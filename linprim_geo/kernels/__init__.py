@@ -1,1 +1,2 @@
-"""The only package that calls the compiled core: rasterizer, losses, optimiser, stereo, TSDF, operators on surfaces."""
+"""Python interface of the compiled core, and the only package that calls it: rasterizer, losses, optimiser, stereo,
+TSDF fusion, surface operators."""

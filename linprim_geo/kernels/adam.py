@@ -1,4 +1,4 @@
-"""Adam in the compiled core: over whole tensors, or over the rows that a view touched."""
+"""Adam in the compiled core, on whole tensors or only on the rows that a view touched."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def adam_step(
     beta2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> None:
-    """One Adam step with bias correction on float32 tensors, in place; `step` counts from 1.
+    """Make one Adam step with bias correction on float32 tensors, in place. `step` counts from 1.
 
     Source: Kingma and Ba, ICLR 2015, algorithm 1.
     """
@@ -54,27 +54,27 @@ def adam_rows(
     beta2: float = 0.999,
     epsilon: float = 1e-15,
 ) -> None:
-    """One sparse Adam step on the touched rows of several float32 tensors, in place and in one sweep.
+    """Make one sparse Adam step on the touched rows of several float32 tensors, in place and in one pass.
 
-    A touched row's count of steps t goes up by one and its moments are corrected by 1 - beta^t: every row goes through
-    exactly the Adam of the steps that touched it, however rare they are. Of the other rows nothing changes, neither
-    value, moments nor count, where `adam_step` would let them glide on by their first moment and shrink both. With all
-    rows touched in every step the two are the same.
+    For a touched row, its step count t increases by one and its moments are corrected by 1 - beta^t: every row gets
+    exactly the Adam updates of the steps that touched it, however rare they are. Untouched rows keep value, moments and
+    count, whereas `adam_step` would keep moving them by their first moment and decay both moments. If every step
+    touches all rows, the two are the same.
 
     Args:
-        values, gradients, firsts, seconds: as many tensors each, with N rows of any shape; the gradients of untouched
-            rows do not count.
+        values, gradients, firsts, seconds: the same number of tensors each, with N rows of any shape. Gradients of
+            untouched rows are ignored.
         rates: learning rate of each tensor.
-        steps: (N,) int32, 0 for a row without a history. To forget a row's history, set it and both moments to 0.
-        touched: (N,) bool; None: the rows where any of the tensors has a gradient that is not 0, which costs reading
-            the gradients of the others as well.
+        steps: (N,) int32, 0 for a row without a history. To reset a row's history, set it and both moments to 0.
+        touched: (N,) bool; None: the rows where any of the tensors has a non-zero gradient, which requires reading the
+            gradients of all rows.
 
     Raises:
         ValueError: shapes, dtypes or layouts that do not fit.
 
-    Source: Kingma and Ba, ICLR 2015, algorithm 1, by row. (The sparse Adam of 3DGS's later code freezes unseen rows
-        alike, but corrects by the global step, which takes a row seen rarely for one that has had zero gradients, and
-        its first steps are too small or large.)
+    Source: Kingma and Ba, ICLR 2015, algorithm 1, per row. (The sparse Adam of 3DGS's later code also freezes unseen
+    rows, but corrects by the global step: it treats a rarely seen row like one with zero gradients in between, so its
+    first steps are too small or too large.)
     """
     for name, tensors in (("value", values), ("gradient", gradients), ("first", firsts), ("second", seconds)):
         for tensor in tensors:

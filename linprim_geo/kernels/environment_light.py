@@ -1,4 +1,4 @@
-"""The light of a cube map at infinity behind transparent primitives, as a torch operator."""
+"""The light of an environment map behind transparent primitives, as a torch operator."""
 
 from __future__ import annotations
 
@@ -58,37 +58,39 @@ define("environment_light", _environment, _environment_fake, _environment_backwa
 
 
 def environment_light(opacity: Tensor, texels: Tensor, camera: Camera, least: float = 0.0) -> Tensor:
-    """(3, H, W) light of a cube map at infinity that passes primitives of (H, W) `opacity`: (1 - opacity) * colour of a
-    pixel's direction. Added to an image that was rendered over black, it is the image before that environment.
+    """Return the (3, H, W) light of a cube map at infinity that passes primitives of (H, W) `opacity`: (1 - opacity) *
+    colour in the direction of the pixel.
 
-    Face 2a of the map is that of directions d whose largest coordinate is d_a > 0, face 2a + 1 that of d_a < 0; columns
-    go with d_b / |d_a| and rows with d_c / |d_a| from -1 to 1, (a, b, c) cyclic. Colours between texel centres are
-    bilinear; beyond a face's border its neighbour's nearest texel counts, so that seams stay within the difference of
-    two neighbouring texels.
+    Added to an image that was rendered over black, it gives the image with the environment behind it.
+
+    Face 2a of the cube map contains the directions d whose largest coordinate is d_a > 0, face 2a + 1 those with d_a <
+    0. Columns correspond to d_b / |d_a| and rows to d_c / |d_a| from -1 to 1, with (a, b, c) cyclic. Colours between
+    texel centres are interpolated bilinearly. Beyond a face's border, the nearest texel of the neighbouring face is
+    used, so a seam is at most the difference of two neighbouring texels.
 
     Args:
-        opacity: (H, W) as `rasterize` gives it; float32 or float64, both tensors alike.
+        opacity: (H, W) as returned by `rasterize`; float32 or float64, the same for both tensors.
         texels: (6, S, S, 3) colours.
-        camera: of the rendering; its place does not matter.
-        least: where 1 - opacity is below this the light is 0: the ray has ended.
+        camera: camera of the rendering; its position does not matter.
+        least: where 1 - opacity is below this, the ray has ended and the light is 0.
 
     Raises:
         ValueError: shapes or dtypes that do not fit.
 
-    Gradient: to opacity (0 where it is 1) and texels; once.
+    Gradient: to opacity (0 where it is 1) and texels; not differentiable twice.
 
-    Accuracy: places are computed in double, colours in the tensors' type; float64 agrees with
+    Accuracy: positions are computed in double, colours in the tensors' type; float64 agrees with
     `reference.environment_light` to 1e-12.
     """
     return torch.ops.linprim_geo.environment_light(opacity, texels, *_directions(camera), least)
 
 
 def environment_weights(values: Tensor, opacity: Tensor, size: int, camera: Camera) -> Tensor:
-    """(6, size, size, 3) sums over pixels of 1 - opacity times (3, H, W) `values` times the weight of each texel in the
-    pixel: the adjoint of `environment_light`."""
+    """Return (6, size, size, 3) sums over pixels of (1 - opacity) times (3, H, W) `values` times the weight of each
+    texel in the pixel: the adjoint of `environment_light`."""
     return torch.ops.linprim_geo.environment_light_grad(values, opacity, size, *_directions(camera), 0.0)
 
 
 def _directions(camera: Camera) -> tuple[list[float], list[float]]:
-    """The rotation and the lens of a camera, all that matters at infinity."""
+    """Return a camera's rotation and intrinsics; its position does not matter at infinity."""
     return camera.rotation.reshape(-1).tolist(), [camera.fx, camera.fy, camera.cx, camera.cy]

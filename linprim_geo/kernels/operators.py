@@ -1,6 +1,6 @@
-"""How functions of the compiled core become torch operators (`torch.ops.linprim_geo.*`), and the checks they share.
+"""Define functions of the compiled core as torch operators (`torch.ops.linprim_geo.*`), and check their arguments.
 
-Arrays cross as `tensor.detach().numpy()`: no copy where a tensor is contiguous.
+Arrays are passed as `tensor.detach().numpy()`, without a copy if the tensor is contiguous.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from torch import Tensor
 from linprim_geo import _core
 from linprim_geo.base.errors import LinprimError
 
-# Operators live as long as this does.
+# The operators exist as long as this object.
 _LIBRARY = torch.library.Library("linprim_geo", "DEF")
 
 
@@ -24,15 +24,15 @@ def define(
     backward: Callable | None = None,
     setup: Callable | None = None,
 ) -> None:
-    """Makes `compute`, whose annotations say what it takes and gives, the operator `name` of tensors in memory.
+    """Define `compute`, whose annotations give its argument and result types, as the CPU operator `name`.
 
-    What `torch.library.custom_op` does, but for one thing: calling those loads torch's compiler, which takes every
-    process a second.
+    Does the same as `torch.library.custom_op`, except that calling an operator does not load torch's compiler, which
+    would take every process a second.
 
     Args:
-        fake: the same without the numbers, for tracing.
-        backward, setup: its gradient, as for `torch.library.register_autograd`; without, asking for one raises
-            RuntimeError.
+        fake: the same function without values, for tracing.
+        backward, setup: its gradient, as for `torch.library.register_autograd`; without it, requesting a gradient
+            raises RuntimeError.
     """
     whole = f"linprim_geo::{name}"
     _LIBRARY.define(name + torch.library.infer_schema(compute, mutates_args=()))

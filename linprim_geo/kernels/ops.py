@@ -1,4 +1,4 @@
-"""What the compiled core does with tensors, under one name; its thread pool, and the choice of its instruction set.
+"""All operators of the compiled core on tensors under one name, its thread pool, and the choice of its instruction set.
 
 `rasterize`, `environment_light` and `photometric_loss` are differentiable operators (`torch.ops.linprim_geo.*`) with
 fake implementations for tracing.
@@ -25,7 +25,7 @@ from linprim_geo.kernels.rasterize import has_kernels as has_kernels
 from linprim_geo.kernels.rasterize import level_depth as level_depth
 from linprim_geo.kernels.rasterize import rasterize as rasterize
 
-# The core takes the environment's choice by itself where it can; a choice it cannot take should not pass unseen.
+# The core applies LINPRIM_GEO_ISA itself if it can; raise an error here if it could not.
 if os.environ.get("LINPRIM_GEO_ISA", "auto") not in ("auto", _core.instruction_set()):
     raise LinprimError(
         f"LINPRIM_GEO_ISA is {os.environ['LINPRIM_GEO_ISA']!r}, which this processor or build does not have;"
@@ -36,17 +36,17 @@ LOG2_E = 1.4426950408889634
 
 
 def set_threads(count: int) -> None:
-    """Threads of the core, 0 for one per core that this process may use. No result depends on it. Not to be called
-    while another thread renders."""
+    """Set the number of threads of the core; 0 means one per core that this process may use. No result depends on it.
+    Do not call it while another thread renders."""
     _core.set_threads(count or usable_cores())
 
 
 def threads() -> int:
-    """Threads the core uses."""
+    """Return the number of threads that the core uses."""
     return _core.threads()
 
 
-set_threads(0)  # the core by itself takes every core of the machine, whatever the quota of its container
+set_threads(0)  # by default the core uses every core of the machine, even beyond the quota of its container
 
 
 class _Exponential(torch.autograd.Function):
@@ -63,35 +63,36 @@ class _Exponential(torch.autograd.Function):
 
 
 def exponential(x: Tensor) -> Tensor:
-    """e^x of float32, with the same bits on the processors of all makers.
+    """Return e^x of float32, bitwise equal on processors of all makers.
 
-    `torch.exp` and `torch.sqrt` go to MKL's vector library, which has other code for Intel's processors than for
-    others; `exp2` is torch's own. Taken in float64 and rounded once.
+    `torch.exp` and `torch.sqrt` call MKL's vector library, which uses different code on Intel's processors than on
+    others; `exp2` is torch's own. It is computed in float64 and rounded once.
     """
     return _Exponential.apply(x)
 
 
 def instruction_set() -> str:
-    """Name of the vector kernels in use: scalar, v2, v3, v4 (x86-64 levels) or neon."""
+    """Return the name of the vector kernels in use: scalar, v2, v3, v4 (x86-64 levels) or neon."""
     return _core.instruction_set()
 
 
 def set_instruction_set(name: str) -> None:
-    """Chooses the vector kernels by name, or the best with "auto"."""
+    """Select the vector kernels by name, or the best ones with "auto"."""
     if not _core.set_instruction_set(name):
         raise LinprimError(f"instruction set {name!r} is not available on this processor; scalar always is")
 
 
 def machine_limits() -> dict[str, float]:
-    """What one core does at this moment with the instruction set in use: `fma_gflops`, `exp_ns` per value, and
-    `pair_forward_ns` and `pair_backward_ns` per (pixel, primitive) of octahedra by exact rays with all data in the
-    first cache and every pixel hit.
+    """Measure the current speed of one core with the instruction set in use.
 
-    Takes some milliseconds on the calling thread; each is the shortest of fifteen.
+    Returns: `fma_gflops`; `exp_ns` per value; `pair_forward_ns` and `pair_backward_ns` per (pixel, primitive) pair, for
+    octahedra with exact rays, all data in the first-level cache and every pixel hit.
+
+    Takes some milliseconds on the calling thread; each value is the shortest of fifteen measurements.
     """
     return _core.limits()
 
 
 def statistics() -> dict[str, float]:
-    """Counts and milliseconds per stage of the last `rasterize` and its gradient."""
+    """Return counts, and milliseconds per stage, of the last `rasterize` and its backward pass."""
     return _core.statistics()

@@ -37,15 +37,16 @@ define("photometric_loss", _photometric, _photometric_fake, _photometric_backwar
 
 
 def photometric_loss(image: Tensor, target: Tensor, dssim: float = 0.2, weight: Tensor | None = None) -> Tensor:
-    """(1 - dssim) L1 + dssim (1 - SSIM) of two float32 images (3, H, W), with its analytic gradient to `image`.
+    """Return (1 - dssim) L1 + dssim (1 - SSIM) of two float32 images (3, H, W), with its analytic gradient to `image`.
 
-    SSIM: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W)
-    multiplies both maps, whose means are over the weight.
+    SSIM: 11x11 Gaussian window with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2. `weight` (H, W)
+    multiplies both maps; their means are weighted means.
 
-    Returns: (4,) float64: the loss, L1, SSIM and the mean squared error. Only the loss has a gradient, to `image`,
-    once.
+    Returns: (4,) float64: the loss, L1, SSIM and the mean squared error. Only the loss has a gradient, to `image`; not
+    differentiable twice.
 
-    Accuracy: loss within 1e-6, gradient within 1e-4 relative of `reference.photometric_loss` in float64 on photographs;
-        SSIM takes variances as differences of float32 moments, so on bright images without any contrast 1e-5 and 5e-4.
+    Accuracy: loss within 1e-6 and gradient within 1e-4 relative of `reference.photometric_loss` in float64 on
+    photographs; SSIM computes variances as differences of float32 moments, so 1e-5 and 5e-4 on bright images without
+    contrast.
     """
     return torch.ops.linprim_geo.photometric_loss(image, target, dssim, weight)[0]

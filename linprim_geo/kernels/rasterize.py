@@ -1,4 +1,4 @@
-"""The rasterizer of the compiled core as a torch operator, and the depth at a level of transmittance."""
+"""The rasterizer of the compiled core as a differentiable torch operator, and depth maps at a given transmittance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from linprim_geo.base import kinds
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels.operators import as_array, check_dtypes, check_finite, define, scalar_suffix
 
-# Planes in the order the core wants them; the last one is private state for the backward pass.
+# Output images in the order that the core expects; the last one is internal state for the backward pass.
 _PLANES = (
     "rgb",
     "opacity",
@@ -32,8 +32,9 @@ def _planes(like: Tensor, width: int, height: int, geometry: bool) -> list[Tenso
     return [like.new_empty(shape if i < 2 or geometry else (0,)) for i, shape in enumerate(shapes)]
 
 
-# What the two operators take beside tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter; `choices`:
-# width, height, and the indices of primitive, ray model and order in these lists, and whether the geometry is wanted.
+# Arguments of the two operators other than tensors. `numbers`: fx, fy, cx, cy, near, stop, level, screen_filter;
+# `choices`: width, height, the indices of primitive, ray model and order in these lists, and whether geometry is
+# wanted.
 KINDS = tuple(kinds.KINDS)
 RAY_MODELS = ("exact", "affine")
 ORDERS = ("center", "entry", "overlap")
@@ -82,7 +83,7 @@ def _rasterize(
         pixels.numpy(),
     )
     check_finite(suffix, sh=color)
-    # torch reads the number of outputs from the annotation; the planes are a list of nine.
+    # torch takes the number of outputs from the annotation; the planes are a list of nine.
     return (*planes, color, max_weight, pixels)  # type: ignore[return-value]
 
 
@@ -166,13 +167,13 @@ define("rasterize", _rasterize, _rasterize_fake, _rasterize_backward, _rasterize
 
 @dataclass(frozen=True)
 class Rendering:
-    """What `rasterize` returns. Images are (3, H, W) or (H, W); all depths are z-depths; 0 where a ray has none.
+    """Result of `rasterize`. Images are (3, H, W) or (H, W); all depths are z-depths, 0 where a ray has none.
 
-    The geometry fields are None unless they were asked for.
+    The geometry fields are None unless geometry was requested.
     """
 
-    rgb: Tensor  # (3, H, W) colour over the background
-    opacity: Tensor  # (H, W) 1 - transmittance behind everything
+    rgb: Tensor  # (3, H, W) colour composited over the background
+    opacity: Tensor  # (H, W) 1 - transmittance behind all primitives
     depth_expected: Tensor | None = (
         None  # sum of weight * mean depth inside the primitive; divide by opacity for a mean
     )
@@ -180,8 +181,8 @@ class Rendering:
     depth_first: Tensor | None = None  # entry into the first primitive
     distortion: Tensor | None = None  # sum over pairs i < j of w_i w_j (z_i - z_j)^2
     normal: Tensor | None = None  # (3, H, W) sum of weight * unit normal of the entry face, camera frame
-    normal_median: Tensor | None = None  # (3, H, W) that of the primitive at the median depth
-    max_weight: Tensor | None = None  # (N,) largest weight T alpha a primitive reaches in any pixel
+    normal_median: Tensor | None = None  # (3, H, W) unit normal of the primitive at the median depth
+    max_weight: Tensor | None = None  # (N,) largest blending weight T alpha of a primitive in any pixel
     pixels: Tensor | None = None  # (N,) int32 number of pixels that hit a primitive
 
 
@@ -205,54 +206,58 @@ def rasterize(
     samples: int = 1,
     screen: Tensor | None = None,
 ) -> Rendering:
-    """Renders transparent primitives, by default octahedra blended front to back in the order of their centres' depth,
-    by exact perspective.
+    """Render transparent primitives; by default octahedra with exact perspective, blended front to back in the order of
+    their centres' depths.
 
-    A ray of direction (u, v, 1) is inside a polyhedron for z-depths t_in < t < t_out; its optical thickness there is
-    tau = density |(u, v, 1)| (t_out - t_in), its weight T (1 - exp(-tau)), and T is multiplied by exp(-tau).
+    A ray with direction (u, v, 1) is inside a polyhedron for z-depths t_in < t < t_out. Its optical thickness there is
+    tau = density |(u, v, 1)| (t_out - t_in), its blending weight T (1 - exp(-tau)), and the transmittance T is then
+    multiplied by exp(-tau).
 
     Args:
-        center: (N, 3) world positions. float32 or float64; all tensors alike.
-        rotation: (N, 4) quaternions w, x, y, z of any length but 0, which means no rotation.
+        center: (N, 3) world positions. float32 or float64; the same for all tensors.
+        rotation: (N, 4) quaternions w, x, y, z of any length; length 0 means no rotation.
         extent: (N, 3) half-axes of octahedra, (N, 4) distances of a tetrahedron's vertices along (1, 1, 1), (1, -1,
             -1), (-1, 1, -1) and (-1, -1, 1), or (N, 3) standard deviations of Gaussians; world units. A primitive with
-            one that is not positive is not drawn; those below 1e-15 or above 1e12 are taken as these.
-        density: (N,) optical thickness per world unit; below 0 counts as 0. Of Gaussians the peak opacity, 0 to 1.
-        sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum at the direction from the
+            an extent that is not positive is not drawn; values are clamped to the range from 1e-15 to 1e12.
+        density: (N,) optical thickness per world unit; negative values count as 0. For Gaussians the peak opacity, 0 to
+            1.
+        sh: (N, K, 3) spherical harmonics, K = 1, 4, 9 or 16; colour = max(0, 0.5 + their sum in the direction from the
             camera to the centre).
-        background: (3,) colour behind everything.
+        background: (3,) colour behind all primitives.
         camera: pinhole camera in the frame of the centres.
-        primitive: "octahedron", "tetrahedron", or "gaussian": 3D Gaussian splatting's, projected, alpha at most 0.99
-            and nothing below 1/255, one depth each.
-        ray_model: "exact" perspective, or "affine": inside one primitive rays are parallel in the ray space of its
-            centre, nothing is cut at the near plane, and a primitive whose centre is before it is not drawn. The ray
-            space of a centre farther than 0.15 of the image's size outside of it is that of the nearest place within.
-            Gaussians are always affine.
-        order: "center": blended by the depth of their centres; "entry": by each ray's own entry depth; "overlap":
-            absorbing where they are, overlaps included, which depends on no order: the integral itself. Gaussians go
-            with "center" only.
-        screen_filter: enlarges a polyhedron's box on the screen by half this many pixels on every side and thins it in
-            proportion; to a Gaussian's variance it is added, in square pixels. 0 is off.
+        primitive: "octahedron", "tetrahedron", or "gaussian": the projected Gaussians of 3D Gaussian splatting, with
+            alpha at most 0.99, nothing below 1/255, and one depth each.
+        ray_model: "exact" perspective, or "affine": rays within a primitive are parallel in the ray space of its
+            centre, nothing is cut at the near plane, and a primitive whose centre lies before the near plane is not
+            drawn. For a centre farther than 0.15 of the image's size outside of the image, the ray space of the nearest
+            position within that margin is used. Gaussians are always affine.
+        order: "center": blended by the depth of the centres; "entry": by each ray's entry depth; "overlap": densities
+            add up where primitives overlap, so the volume rendering integral is exact and depends on no order.
+            Gaussians support "center" only.
+        screen_filter: enlarges a polyhedron's bounding box on the screen by half this many pixels on every side, and
+            reduces its density in proportion; for Gaussians it is added to the variance, in square pixels. 0 is off.
         near: z-depth at which rays begin, world units.
-        stop: a ray ends when its transmittance is below this; 0 = never.
+        stop: a ray ends when its transmittance falls below this; 0 = never.
         level: transmittance at which `depth_median` is taken.
-        geometry: also compute depths, normals, distortion and the per-primitive statistics (about twice the time).
-        samples: render this many by this many rays per pixel and average: photographs average over a pixel, so edges
-            need it. The geometry has no meaningful average, so it goes with 1 only.
-        screen: (N, 3) zeros. The gradient of the first two is that of the loss to the projected centres, per pixel; the
-            third is no gradient but the sum over 16x16 tiles of the length of each tile's part of it: how hard the
-            image pulls, without cancelling. What crosses the near plane moves as at the middle of its depths beyond.
+        geometry: also compute depths, normals, distortion and per-primitive statistics (takes about twice the time).
+        samples: render with this many by this many rays per pixel and average them. A photograph averages over each
+            pixel, so edges need this. Geometry has no meaningful average, so it requires 1.
+        screen: (N, 3) zeros that receive screen-space gradients. The first two columns are the loss gradient to the
+            projected centres, per pixel. The third is the sum, over 16x16 tiles, of the norm of each tile's
+            contribution, so that contributions do not cancel. For a primitive that crosses the near plane, the
+            projected centre is taken at the middle of its depths beyond the plane.
 
     Raises:
-        LinprimError: a non-finite input (naming tensor and row; in sh, of primitives that are in view) or a dtype other
-            than float32, float64.
-        ValueError: shapes, dtypes, a camera or choices that do not fit.
+        LinprimError: a non-finite input (the message names tensor and row; in sh, only of primitives in view) or a
+            dtype other than float32 or float64.
+        ValueError: shapes, dtypes, a camera or options that do not fit.
 
-    Gradient: to center, rotation, extent, density, sh, background and screen, of every image; once.
+    Gradient: from every output image to center, rotation, extent, density, sh, background and screen; not
+    differentiable twice.
 
     Accuracy: float64 agrees with `reference.rasterize` to 1e-9 relative; float32 to about 1e-5 of the image's range,
-        except for a plate thinner than 1e-2 that the near plane cuts (about 1e-7 * distance / thickness). Bitwise the
-        same at any number of threads.
+    except for a plate thinner than 1e-2 that is cut by the near plane (about 1e-7 * distance / thickness). Bitwise the
+    same for any number of threads.
 
     Source: LinPrim (von Luetzow and Niessner, arXiv 2501.16312) for the primitive and its density.
     """
@@ -309,11 +314,12 @@ def rasterize(
     )
     if not geometry:
         return Rendering(out[0], out[1])
-    return Rendering(*out[:8], *out[10:])  # without what is for the backward pass
+    return Rendering(*out[:8], *out[10:])  # without the state for the backward pass
 
 
 def has_kernels(primitive: str, ray_model: str, order: str) -> bool:
-    """Whether `rasterize` takes this combination: a Gaussian has no entry, so it knows the order of centres only."""
+    """Return whether `rasterize` supports this combination. Gaussians have no entry point, so they support only the
+    order "center"."""
     return _core.has_kernels_f32(KINDS.index(primitive), RAY_MODELS.index(ray_model), ORDERS.index(order))
 
 
@@ -371,12 +377,12 @@ def level_depth(
     screen_filter: float = 0.0,
     near: float = 0.01,
 ) -> tuple[Tensor, Tensor]:
-    """(H, W) z-depth at which the transmittance of each ray falls to `level`, 0 where it never does, and (H, W) opacity
-    behind everything; no gradients.
+    """Return (H, W) z-depths at which the transmittance of each ray falls to `level` (0 if it never does), and the (H,
+    W) opacity of the whole ray; no gradients.
 
-    Unlike `rasterize`'s depths it depends on no order: primitives absorb where they are, overlaps included, so the
-    depth solves sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments as for
-    `rasterize`, of polyhedra; 0 < level < 1.
+    Unlike the depths of `rasterize`, the result does not depend on a blending order: densities add up where primitives
+    overlap, so the depth solves sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). Arguments
+    as for `rasterize`, for polyhedra; 0 < level < 1.
 
     Raises: as `rasterize`.
 

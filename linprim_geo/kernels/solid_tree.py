@@ -1,4 +1,4 @@
-"""Optical depth of many straight segments through polyhedra, by a hierarchy of boxes in the compiled core."""
+"""Optical depth of many line segments through polyhedra, by a bounding box hierarchy in the compiled core."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from linprim_geo.kernels.ops import KINDS
 
 
 class SolidTree:
-    """Polyhedra in a hierarchy of boxes, for the optical depth of many straight segments: closed form, overlaps
-    included.
+    """Polyhedra in a bounding box hierarchy, for the optical depth of many line segments, in closed form and including
+    overlaps.
 
     Args:
         center, rotation, extent, density, primitive: as for `rasterize`, of octahedra or tetrahedra. Copied.
 
     Raises:
-        LinprimError: a non-finite input, naming tensor and row, or a dtype other than float32, float64.
+        LinprimError: a non-finite input (the message names tensor and row), or a dtype other than float32 or float64.
         ValueError: shapes or dtypes that do not fit, or Gaussians, which have no inside.
     """
 
@@ -42,31 +42,32 @@ class SolidTree:
         self._tree = _core.SolidTree(KINDS.index(primitive), *[as_array(tensor) for tensor in given.values()])
 
     def __len__(self) -> int:
-        """Number of primitives that absorb at all."""
+        """Return the number of primitives that absorb light."""
         return len(self._tree)
 
     def optical_depth(
         self, origin: Tensor, ends: Tensor, *, begin: Tensor | None = None, most: float = math.inf
     ) -> Tensor:
-        """(P,) float64 optical depths min(most, sum_i density_i length_i), length_i that of the part of a segment
-        inside primitive i.
+        """Return (P,) float64 optical depths min(most, sum_i density_i length_i), with length_i the length of the
+        segment inside primitive i.
 
-        The transmittance of a segment is exp of minus that. No camera, no near plane, no order; no gradients.
+        The transmittance of a segment is exp(-optical depth). There is no camera, no near plane and no order; no
+        gradients.
 
         Args:
-            origin: (3,) float64, the point that all segments start from.
-            ends: (P, 3) float64. Where neighbours lie near each other this is many times faster.
-            begin: (P,) float64 share of the way at which a segment begins, to leave out what is before a near plane;
+            origin: (3,) float64, the common start point of all segments.
+            ends: (P, 3) float64 end points. Many times faster if consecutive points are close to each other.
+            begin: (P,) float64 share of the way at which a segment begins, to leave out the part before a near plane;
                 default 0.
-            most: optical depth above which none is needed: walks end there.
+            most: upper limit of the optical depth; the computation of a segment ends there.
 
         Raises:
             LinprimError: a non-finite input.
             ValueError: shapes or dtypes that do not fit, or `most` not positive.
 
-        Accuracy: each length to 1e-14 of the distance from the origin to the primitive, times 1 / sin of the angle
-            between the segment and the nearest to parallel of the faces it meets. Bitwise the same at any number of
-            threads and for any other ends.
+        Accuracy: each length to 1e-14 of the distance from the origin to the primitive, times 1 / sin of the smallest
+        angle between the segment and a face that it meets. Bitwise the same for any number of threads and independent
+        of the other segments.
         """
         check_dtypes(torch.float64, origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))
         check_finite("f64", origin=origin, ends=ends, **({} if begin is None else {"begin": begin}))

@@ -1,5 +1,5 @@
-"""The core's PatchMatch stereo, a plane of inverse depth for every pixel of a photograph, and its comparison of plain
-regions by their shading."""
+"""PatchMatch stereo of the compiled core (a plane of inverse depth per pixel), its filters, comparison of plain regions
+by shading, and votes for Delaunay cells."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from linprim_geo.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class StereoImage:
-    """A photograph as stereo takes it: `camera`, `grey` (H, W) uint8, and `quads` (H, W) uint32, which hold the grey
-    values of 2 by 2 pixels."""
+    """A photograph as stereo input: `camera`, `grey` (H, W) uint8, and `quads` (H, W) uint32, each of which holds the
+    grey values of 2 by 2 pixels for bilinear interpolation."""
 
     camera: Camera
     grey: np.ndarray
@@ -22,7 +22,8 @@ class StereoImage:
 
     @classmethod
     def of(cls, camera: Camera, grey: np.ndarray) -> StereoImage:
-        """Of (H, W) uint8 grey values. Pixels beyond the right and lower border are those at it."""
+        """Return a stereo image of (H, W) uint8 grey values. Border pixels are repeated beyond the right and lower
+        border."""
         padded = np.pad(grey, ((0, 1), (0, 1)), mode="edge").astype(np.uint32)
         quads = padded[:-1, :-1] | padded[:-1, 1:] << 8 | padded[1:, :-1] << 16 | padded[1:, 1:] << 24
         return cls(camera, np.ascontiguousarray(grey), np.ascontiguousarray(quads))
@@ -30,8 +31,11 @@ class StereoImage:
 
 @dataclass
 class DepthPlanes:
-    """Planes of a photograph's pixels: `plane` (H, W, 3) float32 inverse depth and how it changes per column and row,
-    `cost` (H, W) float32 from 0 (all agree) to 2, `chosen` (H, W) uint8 with a bit for each source that agrees."""
+    """Depth planes of a photograph's pixels.
+
+    `plane` (H, W, 3) float32: inverse depth and its slope per column and per row. `cost` (H, W) float32: from 0 (all
+    source views agree) to 2. `chosen` (H, W) uint8: one bit for each source view that agrees.
+    """
 
     plane: np.ndarray
     cost: np.ndarray
@@ -39,7 +43,7 @@ class DepthPlanes:
 
     @classmethod
     def unknown(cls, height: int, width: int) -> DepthPlanes:
-        """Planes of NaN: `patch_match` begins with random ones there."""
+        """Return planes of NaN; `patch_match` starts from random planes there."""
         return cls(
             np.full((height, width, 3), np.nan, np.float32),
             np.full((height, width), 2, np.float32),
@@ -59,24 +63,24 @@ def patch_match(
     seed: int = 0,
     source_depths: list[np.ndarray] | None = None,
 ) -> None:
-    """Improves the planes of an image in place: their cost is found anew, then `iterations` red-black sweeps.
+    """Improve the planes of an image in place: recompute their cost, then run `iterations` red-black sweeps.
 
-    The cost of a plane in a source is 1 minus the normalised cross correlation of windows of 11 by 11 pixels, with
-    bilateral weights and `noise` added to both variances, so that windows without texture agree and disagree by
-    nothing; a plane maps a window by its derivative at the middle. With `source_depths` 0.1 is added for every pixel
-    that a point misses its own by when it comes back from the surface there, up to 0.4.
+    The cost of a plane in a source view is 1 minus the normalised cross-correlation of 11 by 11 pixel windows with
+    bilateral weights. `noise` is added to both variances, so that windows without texture neither agree nor disagree. A
+    plane maps a window by its derivative at the centre. With `source_depths`, 0.1 is added to the cost per pixel of
+    forward-backward reprojection error, up to 0.4.
 
     Args:
-        sources: 1 to 8 photographs to compare with.
-        inverse_depths: least (0: infinity) and largest.
-        noise: variance of grey values.
-        first: number of the first sweep; steps get smaller and views are chosen more strictly with it.
-        source_depths: (H, W) float32 inverse depths of each source, NaN where unknown.
+        sources: 1 to 8 source views.
+        inverse_depths: smallest (0: infinity) and largest inverse depth.
+        noise: variance of the grey values.
+        first: number of the first sweep; steps get smaller and source views are selected more strictly as it grows.
+        source_depths: (H, W) float32 inverse depths of each source view, NaN where unknown.
 
     Raises:
         ValueError: shapes or dtypes that do not fit.
 
-    Results depend on the seed, not on the number of threads; the last bits also on the instruction set.
+    Results depend on the seed, not on the number of threads; the last bits also depend on the instruction set.
     """
     given = []
     for number, source in enumerate(sources):
@@ -102,12 +106,13 @@ def patch_match(
 
 
 def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray:
-    """(H, W) float32 share of the pixels that belong to each that go on with its surface; 0 where there is no plane.
+    """Return (H, W) float32: the share of the pixels in each pixel's cross whose depth continues its surface; 0 where
+    there is no plane.
 
-    A cross belongs to a pixel: up to 10 pixels up and down with grey values within 25 of its own and, from each of
-    these, up to 10 to the left and to the right within 25 of that one. One goes on with the surface if its inverse
-    depth is what the plane of the pixel has there, or the pixel's what its plane has at the pixel, up to the share
-    `tolerance`.
+    The cross of a pixel contains up to 10 pixels up and down with grey values within 25 of its own and, from each of
+    these, up to 10 to the left and right with grey values within 25 of that one. A pixel continues the surface if its
+    inverse depth agrees with the centre pixel's plane there, or the centre's inverse depth with its own plane at the
+    centre, up to the relative `tolerance`.
 
     Args:
         grey: (H, W) uint8.
@@ -124,21 +129,22 @@ def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray
 
 
 def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, tolerance: float) -> None:
-    """Fits a surface of inverse depth around every pixel, and moves the pixel's plane in place to the tangent plane
+    """Fit a surface of inverse depth around every pixel, and replace the pixel's plane, in place, by the tangent plane
     there.
 
-    A pixel starts from its own plane or that of every fifth pixel each way of its cross (see `support`): the one on
-    which the most of the cross lies, in the sum over what lies there within `tolerance`, 1/2, 1/4 and 1/8 of it. More
-    than half has to lie there within `tolerance`; without such a plane the pixel keeps its own. A surface of second
-    order is fitted in two rounds to what lies on it in the 21x21 pixels around, within the narrowest of the tolerances
-    that more than half of the cross keeps. The pixel keeps the plane that it starts from if there are fewer than 12
-    pixels to fit, or if it would move by more than `tolerance`. One that starts from a plane farther than that from its
-    own takes the mean `cost` of those on it: it may be one without a match of its own. `chosen` stays as it was.
+    Candidates are the pixel's own plane and those of every fifth pixel in each direction of its cross (see `support`).
+    The candidate with the most pixels of the cross on it is selected, by the sum of the counts within `tolerance`, 1/2,
+    1/4 and 1/8 of it. More than half of the cross must lie within `tolerance` of it; otherwise the pixel keeps its own
+    plane. Then a second-order surface is fitted in two rounds to the pixels of the 21x21 window that lie on it, within
+    the narrowest of the tolerances that contains more than half of the cross. The pixel gets the selected plane
+    unchanged if fewer than 12 pixels can be fitted or if the fit would move it by more than `tolerance`. If the
+    selected plane differs from the pixel's own by more than that, its `cost` becomes the mean cost of the pixels on the
+    plane, because the pixel may have no match of its own. `chosen` is unchanged.
 
     Args:
         grey: (H, W) uint8.
-        known: (H, W) bool, which planes count.
-        tolerance: between 0 and 1.
+        known: (H, W) bool, which planes are used.
+        tolerance: relative, between 0 and 1.
 
     Raises:
         ValueError: shapes that do not fit, or such a tolerance.
@@ -157,12 +163,12 @@ def fit_surfaces(grey: np.ndarray, planes: DepthPlanes, known: np.ndarray, toler
 
 @dataclass(frozen=True)
 class ShadedComparison:
-    """N boxes of a plain region as a plane carries them into another photograph.
+    """Comparison of N boxes of a plain region with another photograph, to which a plane maps them.
 
-    `boxes` are shown by both, 0 if these are too few; `shown` (N,) bool says which, and `left` (N,) what is left of
-    their values after an offset, a gain and its bend, 0 of the others. `left_variance` is the weighted variance of
-    that, `variance` that of the values themselves, in squared grey levels. `information` (3, 3) and `downhill` (3,) are
-    Gauss-Newton's equations for the plane's parameters.
+    `boxes`: number of boxes visible in both photographs, 0 if there are too few. `shown` (N,) bool: which ones. `left`
+    (N,): residuals of their grey values after fitting an offset, a gain and its bend, 0 for the others.
+    `left_variance`: weighted variance of the residuals; `variance`: variance of the values themselves; both in squared
+    grey levels. `information` (3, 3) and `downhill` (3,): Gauss-Newton equations for the plane's parameters.
     """
 
     boxes: int
@@ -185,25 +191,25 @@ def compare_shading(
     plain: np.ndarray,
     least: int,
 ) -> ShadedComparison:
-    """Compares boxes of a photograph with another one along a plane.
+    """Compare boxes of a photograph with another photograph along a plane.
 
-    Differences lose weight beyond two deviations (Huber). The gain of the other photograph is between 0.7 and 1.4 and
-    may bend with brightness, as tone curves make it.
+    Residuals beyond two standard deviations are down-weighted (Huber). The gain of the other photograph is limited to
+    the range from 0.7 to 1.4; it may bend with brightness, to model tone curves.
 
     Args:
-        rays: (N, 3) float64 of depth 1 in the camera `own`.
+        rays: (N, 3) float64 with depth 1 in the camera `own`.
         value: (N,) float64 mean grey values of the boxes.
         plane: (3,) with ray . plane = inverse depth.
-        moves: (3, 3) how the plane changes by each of three parameters, in columns.
+        moves: (3, 3) change of the plane by each of three parameters, in columns.
         means: (H, W, 3) float32 of the other photograph: means of the boxes around its pixels, and their slopes per
             column and per row.
-        plain: (H, W) bool, where such a box has no edge.
-        least: fewer boxes than this are none.
+        plain: (H, W) bool, where such a box contains no edge.
+        least: smallest number of boxes for a comparison.
 
     Raises:
         ValueError: shapes that do not fit.
 
-    Accuracy: float64; places in the other photograph are interpolated bilinearly.
+    Accuracy: float64; positions in the other photograph are interpolated bilinearly.
     """
     shown, left = np.empty(len(value), np.uint8), np.empty(len(value))
     information, downhill = np.empty((3, 3)), np.empty(3)
@@ -238,31 +244,31 @@ def vote_for_cells(
     full: float,
     votes: np.ndarray,
 ) -> None:
-    """Adds the votes of rays from one of the points for the tetrahedra that they cross.
+    """Add the votes of rays from one point for the Delaunay tetrahedra that they cross.
 
-    Every cell that has a part of a ray before the share `empty` of its length has one vote more, and the cell at the
-    share `full` one less, if `full` is not 0.
+    Every cell that contains a part of a ray before the share `empty` of its length gets one vote more; the cell at the
+    share `full` gets one less, if `full` is not 0.
 
     Args:
         point: (P, 3) float64.
-        corner, neighbor: (C, 4) int32 of a Delaunay triangulation: rows of the corners of the cells, and the cells
-            behind the faces opposite to them, -1 outside.
-        start: the point where all rays start, a corner of a cell; else there are no votes.
+        corner, neighbor: (C, 4) int32 of a Delaunay triangulation: indices of the corners of the cells, and of the
+            cells behind the faces opposite to them, -1 outside.
+        start: index of the point where all rays start, a corner of a cell; otherwise there are no votes.
         rays: (R, 3) float64, from the start to their ends.
         votes: (C + 1,) int64, of the cells and of the space outside.
 
     Raises:
-        ValueError: shapes that do not fit, or rows that are not there.
+        ValueError: shapes that do not fit, or indices out of range.
 
-    Accuracy: float64; what a ray only touches has no vote of it. Cells without volume may end a ray's walk.
+    Accuracy: float64; a cell that a ray only touches gets no vote. Cells without volume may end the traversal of a ray.
     """
     around = np.flatnonzero((corner == start).any(1)).astype(np.int32)
     _core.vote_for_cells(point, corner, neighbor, start, around, rays, empty, full, votes)
 
 
 def _between(one: Camera, other: Camera) -> tuple[list[float], list[float]]:
-    """The 9 numbers A and 3 numbers b with A (x, y, 1) + b w the homogeneous pixel in `other` of the pixel (x, y) of
-    `one` at inverse depth w; the middle of the first pixel is (0, 0)."""
+    """Return 9 numbers A and 3 numbers b such that A (x, y, 1) + b w is the homogeneous pixel position in `other` of
+    pixel (x, y) of `one` at inverse depth w. The centre of the first pixel is (0, 0)."""
     pose = other.world_to_camera @ np.linalg.inv(one.world_to_camera)
     centered = [camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]] for camera in (one, other)]
     to = centered[1] @ pose[:3, :3] @ np.linalg.inv(centered[0])

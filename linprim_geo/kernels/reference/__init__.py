@@ -1,1 +1,2 @@
-"""The rasterizer and the losses again, in plain torch: slow, independent, for any float type."""
+"""Reference implementations of the rasterizer, the losses and stereo, in plain torch and numpy: slow and independent of
+the core."""

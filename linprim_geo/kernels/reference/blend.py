@@ -1,8 +1,8 @@
-"""How the chords of a ray become pixels, for the slow twin: one after another, or overlapping.
+"""Blending of the reference rasterizer: from the chords of a ray to pixels, in order or as overlapping volumes.
 
-`blend_in_order` walks rank after rank through all rays at once. `blend_overlapping` has no walk at all: which
-primitives fill a segment is asked for every segment by the ranks of their two ends, and its integrals are sums
-over segments, all of whose terms are positive.
+`blend_in_order` processes the k-th chord of all rays at once, for k = 0, 1, ... `blend_overlapping` has no sequential
+loop: for every segment between chord ends, the ranks of the ends determine which primitives fill it, and integrals are
+sums over segments, all of whose terms are positive.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ BLOCK = 4_000_000
 
 
 def mean_depth_fraction(tau: Tensor) -> Tensor:
-    """Returns g(tau) = 1/tau - exp(-tau)/(1 - exp(-tau)): where thickness tau absorbs light on average.
+    """Return g(tau) = 1/tau - exp(-tau)/(1 - exp(-tau)): the mean position at which an optical thickness tau absorbs
+    light.
 
     0 is its entry and 1 its exit; g(0) = 1/2 and g -> 1/tau. Accuracy: 8 eps, relative.
     """
@@ -39,7 +40,8 @@ def mean_depth_fraction(tau: Tensor) -> Tensor:
 
 
 def depth_variance_fraction(tau: Tensor) -> Tensor:
-    """Returns v(tau) = 1/tau^2 - exp(-tau)/(1 - exp(-tau))^2: the variance of where thickness tau absorbs light.
+    """Return v(tau) = 1/tau^2 - exp(-tau)/(1 - exp(-tau))^2: the variance of the position at which an optical thickness
+    tau absorbs light.
 
     It is -g'(tau), g = `mean_depth_fraction`; v(0) = 1/12 and v -> 1/tau^2. Accuracy: 200 eps, relative.
     """
@@ -55,9 +57,9 @@ def depth_variance_fraction(tau: Tensor) -> Tensor:
 
 
 def mean_transmittance(tau: Tensor) -> Tensor:
-    """Returns (1 - exp(-tau)) / tau: the mean of the transmittance inside thickness tau, 1 at 0.
+    """Return (1 - exp(-tau)) / tau: the mean transmittance inside an optical thickness tau, 1 at 0.
 
-    As exp(-h) sinh(h) / h, h = tau / 2, where tau is small. Accuracy: 8 eps, relative, and so is its gradient.
+    Computed as exp(-h) sinh(h) / h, h = tau / 2, where tau is small. Accuracy: 8 eps, relative, as is its gradient.
     """
     thin = tau < SERIES_BELOW
     half = torch.where(thin, tau / 2, torch.zeros_like(tau))
@@ -69,16 +71,17 @@ def mean_transmittance(tau: Tensor) -> Tensor:
 
 
 def _add(image: Tensor, pixels: Tensor, value: Tensor) -> Tensor:
-    """`image` (..., P) plus `value` (..., M) at M distinct pixels. Not index_add, which walks them singly."""
+    """Return `image` (..., P) plus `value` (..., M) at M distinct pixels. Not index_add, which processes them one by
+    one."""
     return image.index_copy(-1, pixels, image[..., pixels] + value)
 
 
 def ranks(chords: Chords, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Sorts the chords of every pixel by `key` (M,), equal ones by primitive.
+    """Sort the chords of every pixel by `key` (M,), equal ones by primitive.
 
     Returns:
         order: (M,) chords by pixel, then by key.
-        rank: (M,) of each of these, its place within its pixel, from 0.
+        rank: (M,) of each of these, its position within its pixel, from 0.
     """
     order = torch.sort(key.detach(), stable=True).indices
     order = order[torch.sort(chords.pixel[order], stable=True).indices]
@@ -98,7 +101,7 @@ def blend_in_order(
     level: float,
     geometry: bool,
 ) -> dict[str, Tensor]:
-    """Blends the chords of each of `count` rays by ascending `key` (M,), ties by index; see `rasterize`.
+    """Blend the chords of each of `count` rays by ascending `key` (M,), ties by index; see `rasterize`.
 
     Args:
         color: (N, 3).
@@ -175,13 +178,14 @@ def blend_overlapping(
     level: float,
     geometry: bool,
 ) -> dict[str, Tensor]:
-    """Integrates emission and absorption where primitives share space; see `rasterize`. The order is no matter.
+    """Integrate emission and absorption where primitives overlap; see `rasterize`. The result does not depend on an
+    order.
 
-    Between two neighbouring ends of chords, at z-depths t_e, the medium is homogeneous. With S_e the thickness
-    before t_e and tau_e that of the segment, T = exp(-S_e) and covered_e = T len (1 - exp(-tau_e)) / tau_e is
-    the integral of T over it. So a primitive weighs rate * (sum of covered_e over its segments), a segment
-    rate_e * covered_e at the mean depth z_e = t_e + len g(tau_e), and the distortion is
-    A sum of w_e (len^2 v(tau_e) + (z_e - mean z)^2).
+    Between two neighbouring chord ends, at z-depths t_e, the medium is homogeneous. With S_e the optical thickness
+    before t_e and tau_e that of the segment, T = exp(-S_e) and covered_e = T len (1 - exp(-tau_e)) / tau_e is the
+    integral of T over it. So a primitive's weight is rate * (sum of covered_e over its segments), a segment's is rate_e
+    * covered_e at the mean depth z_e = t_e + len g(tau_e), and the distortion is A sum of w_e (len^2 v(tau_e) + (z_e -
+    mean z)^2).
 
     Args, returns: as for `blend_in_order`.
 
@@ -221,7 +225,8 @@ def blend_overlapping(
 
 
 def _integrate(chords: Chords, table: Tensor, color: Tensor, stop: float, level: float) -> dict[str, Tensor]:
-    """The images of B rays whose chords are the rows of `table` (B, K), padded with -1, E = 2 K - 1 segments."""
+    """Return the images of B rays whose chords are the rows of `table` (B, K), padded with -1; there are E = 2 K - 1
+    segments."""
     rays, width = table.shape
     there, chord = table >= 0, table.clamp(min=0)
     ends = torch.cat([chords.t_in[chord], chords.t_out[chord]], 1)
@@ -233,7 +238,8 @@ def _integrate(chords: Chords, table: Tensor, color: Tensor, stop: float, level:
     real = segment < 2 * there.sum(1, keepdim=True) - 1
     length = torch.where(real, edges[:, 1:] - edges[:, :-1], torch.zeros_like(edges[:, 1:]))
 
-    # (B, E, K): is the segment within the chord? By places and not by depths, so that ties come out right.
+    # (B, E, K): whether the segment lies within the chord. Compared by rank and not by depth, so that ties are handled
+    # correctly.
     begin, end = place[:, None, :width], place[:, None, width:]
     inside = ((begin <= segment[:, None]) & (segment[:, None] < end) & there[:, None]).to(ends.dtype)
     rate = torch.where(there, chords.rate[chord], torch.zeros_like(ends[:, :width]))
@@ -247,7 +253,7 @@ def _integrate(chords: Chords, table: Tensor, color: Tensor, stop: float, level:
     covered = torch.where(alive, left * length * mean_transmittance(tau), torch.zeros_like(tau))
     weight = rate * (covered[:, None] @ inside)[:, 0]
 
-    # The ray is alive at the place where a chord begins: it takes part, be its weight zero.
+    # A chord takes part if the ray is still alive where it begins, even if its weight is zero.
     took_part = there & alive.gather(1, place[:, :width].clamp(max=2 * width - 2))
     primitive = chords.primitive[chord]
     normals = chords.normal[:, chord]
@@ -264,7 +270,7 @@ def _integrate(chords: Chords, table: Tensor, color: Tensor, stop: float, level:
     mean = edges[:, :-1] + length * mean_depth_fraction(tau)
     result["depth_expected"] = (absorbed * mean).sum(1)
     total = absorbed.sum(1, keepdim=True)
-    # The sum is smallest about its own mean, so the mean needs no gradient.
+    # The sum is minimal about its own mean, so the mean needs no gradient.
     middle = edges[:, :1] + (absorbed * (mean - edges[:, :1])).sum(1, keepdim=True) / torch.where(
         total > 0, total, torch.ones_like(total)
     )

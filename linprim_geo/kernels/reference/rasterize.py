@@ -1,8 +1,8 @@
-"""The slow twin of the compiled rasterizer and of the photometric loss: what they compute, from torch alone.
+"""Reference implementation of the rasterizer, the environment light and the photometric loss, in plain torch.
 
-Nothing here shares a formula with the kernel where another one exists: rays are clipped in the primitive's
-own frame (`reference_shapes`), blended without tiles, bounds or culling (`reference_blend`), and gradients
-come from autograd. Speed is no aim: time grows with primitives x pixels, memory with hits.
+It shares no formula with the compiled kernels where another one exists: rays are clipped in the primitive's own frame
+(`reference.shapes`), blended without tiles, bounds or culling (`reference.blend`), and gradients come from autograd. It
+is not optimised for speed: time grows with primitives x pixels, memory with hits.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
 def rotation_matrix(rotation: Tensor) -> Tensor:
-    """Turns quaternions (..., 4), w x y z, of any length but zero, into rotation matrices (..., 3, 3)."""
+    """Convert quaternions (..., 4), w x y z, of any length but zero, to rotation matrices (..., 3, 3)."""
     w, x, y, z = (rotation / rotation.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -40,11 +40,11 @@ def rotation_matrix(rotation: Tensor) -> Tensor:
 
 
 def sh_basis(direction: Tensor, count: int) -> Tensor:
-    """Evaluates the first `count` real spherical harmonics at unit vectors (..., 3) -> (..., count).
+    """Evaluate the first `count` real spherical harmonics at unit vectors (..., 3) -> (..., count).
 
-    Orthonormal on the sphere; m = -l .. l inside each degree l, with the Condon-Shortley sign (-1)^m: the
-    order and signs of 3D Gaussian splatting. Each factor is sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times
-    sqrt 2 where m != 0, times what the polynomial beside it lacks of the Legendre function.
+    Orthonormal on the sphere; m = -l .. l within each degree l, with the Condon-Shortley sign (-1)^m: the order and
+    signs of 3D Gaussian splatting. Each factor is sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!), times sqrt 2 where m != 0,
+    times the constant by which the Legendre function exceeds the polynomial written here.
 
     Args:
         count: 1, 4, 9 or 16, for degrees 0 to 3.
@@ -85,9 +85,9 @@ def sh_basis(direction: Tensor, count: int) -> Tensor:
 
 
 def primitive_color(center: Tensor, sh: Tensor, camera_position: Tensor) -> Tensor:
-    """Returns max(0, SH(direction) + 0.5), (N, 3); direction is from the camera to each centre, world frame.
+    """Return max(0, SH(direction) + 0.5), (N, 3); the direction is from the camera to each centre, in the world frame.
 
-    A centre exactly at the camera has no direction; the zero vector stands for it and only degree 0 counts.
+    A centre exactly at the camera has no direction; the zero vector is used for it, so only degree 0 counts.
     """
     offset = center - camera_position
     nowhere = (offset == 0).all(-1, keepdim=True)
@@ -97,7 +97,7 @@ def primitive_color(center: Tensor, sh: Tensor, camera_position: Tensor) -> Tens
 
 
 def pixel_rays(width: int, height: int, fx: float, fy: float, cx: float, cy: float, like: Tensor) -> Tensor:
-    """Returns (H * W, 3) rays v = ((u - cx)/fx, (v - cy)/fy, 1) through the pixel centres, row after row."""
+    """Return (H * W, 3) rays v = ((u - cx)/fx, (v - cy)/fy, 1) through the pixel centres, row by row."""
     x = (torch.arange(width, dtype=like.dtype, device=like.device) + 0.5 - cx) / fx
     y = (torch.arange(height, dtype=like.dtype, device=like.device) + 0.5 - cy) / fy
     y, x = torch.meshgrid(y, x, indexing="ij")
@@ -128,42 +128,42 @@ def rasterize(
     level: float = 0.5,
     geometry: bool = True,
 ) -> dict[str, Tensor]:
-    """Renders homogeneous octahedra or tetrahedra, or Gaussians, with every output that may need a gradient.
+    """Render homogeneous octahedra or tetrahedra, or Gaussians, with every output that may need a gradient.
 
-    A ray is x = t v, v = ((px - cx)/fx, (py - cy)/fy, 1), so t is depth. With [t_in, t_out] the part of it
-    inside a primitive, T = 1 at first, and primitives taken in their order:
+    A ray is x = t v, v = ((px - cx)/fx, (py - cy)/fy, 1), so t is depth. With [t_in, t_out] the part of it inside a
+    primitive, T = 1 at the start, and primitives processed in their order:
 
-        hit    t_out > t_in and T >= stop, T as it is before this primitive; otherwise it is skipped entirely
+        hit    t_out > t_in and T >= stop, with T before this primitive; otherwise it is skipped entirely
         tau    = density |v| (t_out - t_in)       alpha = 1 - exp(-tau)
         w      = T alpha                          T <- T exp(-tau)
-        z      = t_in + (t_out - t_in) g(tau)     the mean depth of what it absorbs, g = mean_depth_fraction
+        z      = t_in + (t_out - t_in) g(tau)     mean depth of the absorbed light, g = mean_depth_fraction
 
-    primitive: an octahedron has the vertices center +- extent_k R e_k; a tetrahedron center + extent_j R b_j,
-    sqrt(3) b = (1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1); a Gaussian the covariance R diag(extent^2) R^T and
-    density for its peak's opacity, see `gaussian_chords`, with t_in = t_out = z the depth of its centre.
-    ray_model: exact rays start at t = near; affine ones cross the primitive as a line in ray space, see
-    `polyhedron_chords`. To a Gaussian both are the same. order: see below. screen_filter: a polyhedron's least
-    size on the screen, see `polyhedron_chords`; for a Gaussian a variance.
+    primitive: an octahedron has the vertices center +- extent_k R e_k; a tetrahedron center + extent_j R b_j, sqrt(3) b
+    = (1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1); a Gaussian has the covariance R diag(extent^2) R^T and density as its
+    peak opacity, see `gaussian_chords`, with t_in = t_out = z the depth of its centre. ray_model: exact rays start at t
+    = near; affine ones cross the primitive as a line in ray space, see `polyhedron_chords`. For a Gaussian both are the
+    same. order: see below. screen_filter: smallest size of a polyhedron on the screen, see `polyhedron_chords`; for a
+    Gaussian a variance.
 
         center    ascending camera-space z of the centres (ties by index, negative z allowed), for all pixels
         entry     ascending t_in (ties by index), for each pixel
-        overlap   none: T' = -T |v| sum of density over the primitives that hold the point t v. w is the
+        overlap   none: T' = -T |v| sum of density over the primitives that contain the point t v. w is the
                   integral of T density |v| dt over the primitive's part, z that of t with this weight. The ray
                   ends at the first t_in or t_out with T < stop
 
     Args:
         center: (N, 3), world.
         rotation: (N, 4) quaternions w x y z of any length but zero, primitive to world.
-        extent: (N, 3) > 0, half-axes of octahedra, or >= 0, standard deviations of Gaussians; (N, 4) distances
-            of a tetrahedron's vertices, which is left out if one is not positive. World units.
+        extent: (N, 3) > 0, half-axes of octahedra, or >= 0, standard deviations of Gaussians; (N, 4) distances of a
+            tetrahedron's vertices, which is left out if one is not positive. World units.
         density: (N,) >= 0, 1 / world unit; for Gaussians opacity, 0 to 1.
         sh: (N, K, 3), K = 1, 4, 9 or 16; see `primitive_color`.
         background: (3,).
         world_to_camera: (4, 4), rigid.
         fx, fy, cx, cy: pixels; pixel (i, j) has its centre at (j + 0.5, i + 0.5).
         screen_filter: >= 0, pixels; for Gaussians square pixels.
-        near: depth > 0 at which every exact ray starts; an affine primitive or a Gaussian whose centre is not
-            beyond it is left out.
+        near: depth > 0 at which every exact ray starts; an affine primitive or a Gaussian whose centre is not beyond it
+            is left out.
         stop: transmittance below which a ray ends; 0 means never.
         level: transmittance whose crossing defines the median depth.
         geometry: False computes only rgb, opacity, max_weight and pixels.
@@ -172,35 +172,35 @@ def rasterize(
         rgb (3, H, W): sum of w color, plus T times the background.
         opacity (H, W): 1 - T.
         depth_expected (H, W): sum of w z, not divided by the opacity.
-        depth_median (H, W): where T reaches `level`: t_in + ln(T / level) / (density |v|), at most t_out, in
-            the first primitive with T > level before it and T <= level after it; 0 if there is none. With
-            overlap, the t with T = level.
+        depth_median (H, W): where T reaches `level`: t_in + ln(T / level) / (density |v|), at most t_out, in the first
+            primitive with T > level before it and T <= level after it; 0 if there is none. With overlap, the t with T =
+            level.
         depth_first (H, W): t_in of the first hit in blending order; 0 if there is none.
-        normal (3, H, W): sum of w n, n the unit outward normal of the entry face, camera frame; n = 0 where
-            the ray enters through the near plane.
-        normal_median (3, H, W): n of the primitive that depth_median lies in; 0 if there is none. With overlap,
-            the mean n of the primitives there, weighted by density.
-        distortion (H, W): A M2 - M1^2, A = sum w, M1 = sum w z, M2 = sum w z^2 (half the sum over all pairs
-            of w w' (z - z')^2), taken about the first hit's z, which does not change it but keeps its digits.
-            With overlap, the same of the measure T density |v| dt: one primitive alone has some.
+        normal (3, H, W): sum of w n, n the unit outward normal of the entry face, camera frame; n = 0 where the ray
+            enters through the near plane.
+        normal_median (3, H, W): n of the primitive that contains depth_median; 0 if there is none. With overlap, the
+            mean n of the primitives there, weighted by density.
+        distortion (H, W): A M2 - M1^2, A = sum w, M1 = sum w z, M2 = sum w z^2 (half the sum over all pairs of w w' (z
+            - z')^2). It is computed relative to the first hit's z, which keeps precision and does not change the value.
+            With overlap, the same for the measure T density |v| dt, for which even a single primitive has a distortion.
         max_weight (N,): the largest w over the pixels, 0 if never hit; no gradient.
-        pixels (N,) int64: number of pixels hit; with overlap, in which T >= stop at its t_in.
+        pixels (N,) int64: number of pixels hit; with overlap, those in which T >= stop at its t_in.
 
     Raises:
-        ValueError: K is not 1, 4, 9 or 16, an octahedron's extent is not positive, the width of `extent` is not
-            that of the primitive, a Gaussian is to be ordered by its entry, or a keyword is none of those above.
+        ValueError: K is not 1, 4, 9 or 16, an octahedron's extent is not positive, the number of columns of `extent`
+            does not match the primitive, a Gaussian is to be ordered by its entry, or a keyword is none of those above.
 
     Gradient:
-        By autograd, to the six tensors and to `world_to_camera`; finite for every ray, a one-sided value
-        where a ray meets an edge or a vertex. Order, hits and the choice of faces are piecewise constant.
+        By autograd, to the six tensors and to `world_to_camera`; finite for every ray, a one-sided value where a ray
+            meets an edge or a vertex. Order, hits and the choice of faces are piecewise constant.
 
     Accuracy:
-        A chord's relative error is about eps t / (t_out - t_in): nothing is recentred on a primitive's depth.
-        Use float64 for truth.
+        The relative error of a chord is about eps t / (t_out - t_in), because depths are not relative to the
+            primitive's. Use float64 as ground truth.
 
     Source:
         LinPrim (von Luetzow & Niessner 2025) for polyhedra, order center and affine rays; EVER (Mai et al. 2024) for
-        overlap; 3D Gaussian Splatting (Kerbl et al. 2023) for Gaussians.
+            overlap; 3D Gaussian Splatting (Kerbl et al. 2023) for Gaussians.
     """
     for name, value, known in (
         ("primitive", primitive, PRIMITIVES),
@@ -252,8 +252,8 @@ def rasterize(
 
 @torch.no_grad()
 def environment_light(opacity: Tensor, texels: Tensor, camera: Any, least: float = 0.0) -> Tensor:
-    """What `ops.environment_light` computes, differentiable by autograd: (3, H, W) (1 - opacity) * colour of the
-    pixel's direction."""
+    """Return the (3, H, W) result of `ops.environment_light`, (1 - opacity) * colour in the pixel's direction,
+    differentiable by autograd."""
     size = texels.shape[1]
     rotation = torch.as_tensor(camera.rotation, dtype=opacity.dtype)
     rays = (
@@ -273,7 +273,8 @@ def environment_light(opacity: Tensor, texels: Tensor, camera: Any, least: float
 
 
 def _cube_face(direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of (R, 3) directions the face of the cube, 2a for +a and 2a + 1 for -a, and their coordinates on it, -1 to 1."""
+    """Return, for (R, 3) directions, the face of the cube, 2a for +a and 2a + 1 for -a, and their coordinates on it, -1
+    to 1."""
     axis = direction.abs().argmax(1)
     rows = torch.arange(len(direction))
     largest = direction[rows, axis]
@@ -282,7 +283,8 @@ def _cube_face(direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _texel_at(face: Tensor, x: Tensor, y: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Index (face, row, column) of texels, those beyond the border of a face being the nearest of its neighbour."""
+    """Return the indices (face, row, column) of texels; beyond the border of a face, of the nearest texel of its
+    neighbour."""
     axis, rows = face // 2, torch.arange(len(face))
     direction = torch.zeros(len(face), 3, dtype=x.dtype)
     direction[rows, axis] = 1.0 - 2.0 * (face % 2).to(x.dtype)
@@ -305,23 +307,23 @@ def quadrature_transmittance(
     t: Tensor,
     samples: int = 10_000,
 ) -> Tensor:
-    """Returns exp(-integral of the summed density) on x = origin + s direction, t0 <= s <= t1, by sampling.
+    """Return exp(-integral of the summed density) on x = origin + s direction, t0 <= s <= t1, by sampling.
 
-    There are no intersections, faces or order in it: `samples` midpoints, and for each primitive the question
-    whether |R^T (x - center) / extent|_1 <= 1. From `near` to beyond the last primitive, along rays with a
-    depth of 1, it is 1 - opacity of `rasterize` with stop = 0.
+    It uses no intersections, faces or order, only `samples` midpoints and the test |R^T (x - center) / extent|_1 <= 1
+    for each primitive. From `near` to beyond the last primitive, along rays of depth 1, it equals 1 - opacity of
+    `rasterize` with stop = 0.
 
     Args:
         center, rotation, extent, density: as for `rasterize`.
         origin, direction: (R, 3), world; s is in units of |direction|.
         t: (R, 2), t0 and t1.
-        samples: midpoints on each ray.
+        samples: number of midpoints on each ray.
 
     Returns:
         (R,) transmittance.
 
     Accuracy:
-        The thickness is off by at most density |direction| (t1 - t0) / samples for each primitive.
+        The optical thickness is off by at most density |direction| (t1 - t0) / samples for each primitive.
     """
     fraction = (torch.arange(samples, dtype=center.dtype, device=center.device) + 0.5) / samples
     s = t[:, :1] + (t[:, 1:] - t[:, :1]) * fraction
@@ -334,10 +336,10 @@ def quadrature_transmittance(
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """Returns the structural similarity of two (C, H, W) images in [0, 1] around every pixel, (C, H, W).
+    """Return the structural similarity of two (C, H, W) images in [0, 1] around every pixel, (C, H, W).
 
-    Gaussian window of 11 x 11 pixels, sigma 1.5, zeros outside the image, C1 = 0.01^2, C2 = 0.03^2, variances
-    without n/(n-1).
+    Gaussian window of 11 x 11 pixels, sigma 1.5, zeros outside the image, C1 = 0.01^2, C2 = 0.03^2, variances without
+    n/(n-1).
     """
     x = torch.arange(SSIM_WINDOW, dtype=image.dtype, device=image.device) - SSIM_WINDOW // 2
     line = torch.exp(-x * x / (2 * SSIM_SIGMA**2))
@@ -358,12 +360,12 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 def photometric_loss(image: Tensor, target: Tensor, dssim_weight: float, weight: Tensor | None = None) -> Tensor:
-    """Returns (1 - l) mean |image - target| + l (1 - mean SSIM), l = dssim_weight, over channels and pixels.
+    """Return (1 - l) mean |image - target| + l (1 - mean SSIM), l = dssim_weight, over channels and pixels.
 
     Args:
         image, target: (3, H, W).
-        weight: (H, W) >= 0 makes both means weighted ones; it multiplies the maps, not what the SSIM window
-            sees. All zero gives a loss of 0.
+        weight: (H, W) >= 0 makes both means weighted ones; it multiplies the maps, not the input of the SSIM window. If
+            it is zero everywhere, the loss is 0.
     """
     loss = (1 - dssim_weight) * (image - target).abs() + dssim_weight * (1 - ssim_map(image, target))
     if weight is None:

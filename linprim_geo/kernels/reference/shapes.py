@@ -1,7 +1,7 @@
-"""Where rays meet primitives, for the slow twin: chords of polyhedra, exact or affine, and Gaussian splats.
+"""Ray-primitive intersections of the reference rasterizer: chords of polyhedra, exact or affine, and Gaussian splats.
 
-The kernel works with planes in camera space and closed forms; here a ray is carried into a frame at the
-primitive, by matrices that torch inverts, and clipped by one half-space after another.
+The compiled kernels use planes in camera space and closed forms. Here a ray is transformed into the primitive's frame,
+by matrices that torch inverts, and clipped by one half-space after another.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ GAUSSIAN_SINGULAR = 1e-12
 
 @dataclass(frozen=True)
 class Chords:
-    """The M pairs (pixel, primitive) that meet, by ascending primitive: what a ray crosses of one primitive."""
+    """The M intersections of pixel rays with primitives, by ascending primitive."""
 
     pixel: Tensor  # (M,) int64, index into the rays
     primitive: Tensor  # (M,) int64
     t_in: Tensor  # (M,) z-depth
-    t_out: Tensor  # (M,) z-depth, > t_in; equal for a Gaussian, which absorbs in one point
+    t_out: Tensor  # (M,) z-depth, > t_in; equal for a Gaussian, which absorbs at a single depth
     rate: Tensor  # (M,) optical thickness per unit of z-depth; infinite for a Gaussian
     tau: Tensor  # (M,) optical thickness
     normal: Tensor  # (3, M) camera frame, unit and outward; 0 where the ray enters through the near plane
@@ -41,7 +41,8 @@ class Chords:
 
 @dataclass(frozen=True)
 class _Solid:
-    """One convex solid about its centre: the y with faces . y <= room, y = matrix^T x / scale, x in camera axes."""
+    """A convex polyhedron about its centre: the y with faces . y <= room, where y = matrix^T x / scale and x is in
+    camera axes."""
 
     matrix: Tensor  # (3, 3)
     scale: Tensor  # (3,)
@@ -55,12 +56,13 @@ class _Solid:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Dot product over the last axis, rounded the same in every batch: a subset of rays repeats the whole."""
+    """Return the dot product over the last axis, rounded independently of the batch, so that a subset of rays gives the
+    same bits."""
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 def _octahedron(rotation: Tensor, extent: Tensor) -> _Solid:
-    """In the frame where it is regular, which keeps the digits of one that is long and thin."""
+    """Return an octahedron in the frame where it is regular, which keeps precision for long and thin ones."""
     signs = rotation.new_tensor(FACE_SIGNS)
     outward = signs / extent
     outward = outward / outward.norm(dim=-1, keepdim=True)
@@ -69,7 +71,7 @@ def _octahedron(rotation: Tensor, extent: Tensor) -> _Solid:
 
 
 def _polyhedron(rotation: Tensor, extent: Tensor, kind: Kind) -> _Solid:
-    """The convex hull of a kind's vertices, whose faces are triangles of them."""
+    """Return the convex hull of a kind's vertices; its faces are triangles."""
     directions = torch.from_numpy(kind.directions).to(rotation)
     vertices = extent[torch.from_numpy(kind.columns), None] * (directions @ rotation.T)
     size = extent.detach().max()  # keeps the squares of tiny edges from underflow
@@ -87,10 +89,10 @@ def _polyhedron(rotation: Tensor, extent: Tensor, kind: Kind) -> _Solid:
 
 @torch.no_grad()
 def clip_to_faces(direction: Tensor, origin: Tensor, faces: Tensor, room: Tensor, start: float) -> tuple[Tensor, ...]:
-    """Clips the half-lines y(t) = origin + t direction, t >= start, to the y with faces . y <= room.
+    """Clip the half-lines y(t) = origin + t direction, t >= start, to the y with faces . y <= room.
 
-    One half-space after another: t (n . direction) <= room - n . origin bounds t from above, from below or,
-    where n . direction is exactly zero, not at all or to nothing.
+    Each half-space t (n . direction) <= room - n . origin bounds t from above or below. Where n . direction is exactly
+    zero, it either imposes no bound or excludes the whole line.
 
     Args:
         direction: (P, 3).
@@ -100,8 +102,8 @@ def clip_to_faces(direction: Tensor, origin: Tensor, faces: Tensor, room: Tensor
         start: -inf for whole lines.
 
     Returns:
-        t_in, t_out (P,): empty where t_out <= t_in; and the indices of the faces they lie on, (P,) each, -1
-        where t_in is `start`. The first of several faces met at the same t is named.
+        t_in, t_out (P,): empty where t_out <= t_in; and the indices of their faces, (P,) each, -1 where t_in is
+            `start`. If several faces are met at the same t, the first one is returned.
     """
     t_in = torch.full_like(direction[:, 0], start)
     t_out = torch.full_like(t_in, math.inf)
@@ -118,13 +120,13 @@ def clip_to_faces(direction: Tensor, origin: Tensor, faces: Tensor, room: Tensor
 
 
 def clip_to_octahedron(direction: Tensor, origin: Tensor, near: float) -> tuple[Tensor, ...]:
-    """Clips half-lines to |y0| + |y1| + |y2| <= 1: `clip_to_faces` with faces FACE_SIGNS, each at 1."""
+    """Clip half-lines to |y0| + |y1| + |y2| <= 1: `clip_to_faces` with faces FACE_SIGNS and room 1."""
     signs = direction.new_tensor(FACE_SIGNS)
     return clip_to_faces(direction, origin, signs, torch.ones_like(signs[:, 0]), near)
 
 
 def ray_space_jacobian(center: Tensor) -> Tensor:
-    """Returns d(x/z, y/z, |(x, y, z)|) / d(x, y, z) at `center` (3,), a (3, 3) matrix of determinant |c| / z^3.
+    """Return d(x/z, y/z, |(x, y, z)|) / d(x, y, z) at `center` (3,), a (3, 3) matrix of determinant |c| / z^3.
 
     Source: Zwicker et al., EWA Splatting (2002), the local affine approximation.
     """
@@ -135,17 +137,18 @@ def ray_space_jacobian(center: Tensor) -> Tensor:
 
 
 def view_limits(size: tuple[int, int], focal: tuple[float, float], principal: tuple[float, float]) -> Tensor:
-    """Returns (2, 2) the least and the largest x/z, y/z of the image, in px, and 0.15 of its size around it, float64,
-    within 1e4."""
+    """Return (2, 2) the smallest and largest x/z and y/z of the image extended by 0.15 of its size on each side,
+    float64, clamped to 1e4. `size`, `focal` and `principal` are in px."""
     width, scale, middle = (torch.tensor(x, dtype=torch.float64) for x in (size, focal, principal))
     return torch.stack([(-0.15 * width - middle) / scale, (1.15 * width - middle) / scale]).clamp(-1e4, 1e4)
 
 
 def held_in_view(center: Tensor, limits: Tensor) -> Tensor:
-    """Returns where J is taken for `center` (3,): there, but x/z and y/z held within `limits` of `view_limits`.
+    """Return the position at which J is evaluated for `center` (3,): the centre with x/z and y/z clamped to `limits` of
+    `view_limits`.
 
-    Source: Kerbl et al., 3D Gaussian Splatting (2023), 1.3 times half the field of view: farther out J grows without
-    bound.
+    Farther out, J grows without bound. Source: Kerbl et al., 3D Gaussian Splatting (2023), 1.3 times half the field of
+    view.
     """
     low, high = limits.to(center)
     held = torch.minimum(torch.maximum(center[:2] / center[2], low), high) * center[2]
@@ -153,7 +156,8 @@ def held_in_view(center: Tensor, limits: Tensor) -> Tensor:
 
 
 def _screen_scale(corners: Tensor, focal: Tensor, screen_filter: float) -> Tensor:
-    """Returns (2,) h / (h + screen_filter / 2), h the half width and height in px of `corners` (V, 2), x/z and y/z."""
+    """Return (2,) h / (h + screen_filter / 2), with h the half width and height in px of `corners` (V, 2), x/z and
+    y/z."""
     half = focal * (corners.amax(0) - corners.amin(0)) / 2
     return half / (half + screen_filter / 2)
 
@@ -161,7 +165,8 @@ def _screen_scale(corners: Tensor, focal: Tensor, screen_filter: float) -> Tenso
 def _local_lines(
     rays: Tensor, solid: _Solid, center: Tensor, scale: Tensor | None, inverse: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Origin and direction in the frame of the solid of each ray, drawn to the centre by `scale`.
+    """Return the origin and direction of each ray in the polyhedron's frame, after scaling rays towards the centre by
+    `scale`.
 
     inverse: of `ray_space_jacobian` for affine rays, whose parameter is a distance; None for exact ones, whose
     parameter is a z-depth.
@@ -190,12 +195,12 @@ def polyhedron_chords(
     limits: Tensor,
     near: float,
 ) -> Chords:
-    """Returns the chords of all rays in all octahedra or tetrahedra.
+    """Return the chords of all rays in all octahedra or tetrahedra.
 
-    exact: x = t v, t >= near, is met where it is. affine: ray-space points are (x/z, y/z, |c|) + J (p - c), so
-    the ray of a pixel is the line p(s) = c + J^-1 ((X, Y, s) - (x/z, y/z, |c|)) and t = s / |v|, J that of
-    `held_in_view`; there is no near plane, but a primitive with z <= near is left out. screen_filter: the ray is first
-    drawn towards the centre, by s_x and s_y, and the density multiplied by s_x s_y; |v| stays.
+    exact: x = t v, t >= near, is intersected directly. affine: ray-space points are (x/z, y/z, |c|) + J (p - c), so the
+    ray of a pixel is the line p(s) = c + J^-1 ((X, Y, s) - (x/z, y/z, |c|)) and t = s / |v|, with J at `held_in_view`;
+    there is no near plane, but a primitive with z <= near is left out. screen_filter: the ray is first scaled towards
+    the centre, by s_x and s_y, and the density multiplied by s_x s_y; |v| is unchanged.
 
     Args:
         center: (N, 3), camera frame.
@@ -203,12 +208,12 @@ def polyhedron_chords(
         extent: (N, 3) half-axes > 0, or (N, 4) vertex distances; a tetrahedron with one <= 0 is left out.
         density: (N,).
         rays: (P, 3), v = (X, Y, 1).
-        screen_filter: px, 0 for none. An exact primitive with a vertex at z <= near has none.
+        screen_filter: px, 0 for none. Not applied to an exact primitive with a vertex at z <= near.
         focal: fx, fy in px.
         limits: of `view_limits`.
 
     Gradient:
-        Finite: a face that a ray is parallel to bounds nothing, so no division is by zero.
+        Finite: a face parallel to a ray bounds nothing, so there is no division by zero.
     """
     ray_length = rays.norm(dim=-1)
     pixel_scale = rays.new_tensor(focal)
@@ -230,7 +235,7 @@ def polyhedron_chords(
             scale = _screen_scale(corners, pixel_scale, screen_filter)
             sigma = sigma * scale[0] * scale[1]
 
-        # Which pixels are hit, and through which faces: constant under small changes, so without gradient.
+        # The pixels hit and the faces of entry and exit are constant under small changes, so they need no gradient.
         with torch.no_grad():
             origin, direction = _local_lines(rays, solid, center[i], scale, inverse)
             start = -math.inf if affine else near
@@ -238,7 +243,7 @@ def polyhedron_chords(
             hit = (t_out > t_in).nonzero()[:, 0]
             entry, leave = entry[hit], leave[hit]
 
-        # The two ends again, as functions of the parameters, for the rays that hit and no other.
+        # Both ends again as functions of the parameters, only for the rays that hit.
         origin, direction = _local_lines(rays[hit], solid, center[i], scale, inverse)
         length = ray_length[hit]
         at_near = entry < 0
@@ -268,21 +273,20 @@ def gaussian_chords(
     limits: Tensor,
     near: float,
 ) -> Chords:
-    """Returns the splats of all rays in all Gaussians as chords of no length, at the depth of the centre.
+    """Return the splats of all rays in all Gaussians, as chords of zero length at the depth of the centre.
 
     M = J2 S J2^T + screen_filter I, S = A A^T the covariance in camera axes, J2 the first two rows of
-    `ray_space_jacobian` in px, taken at `held_in_view`; alpha = min(0.99,
-    opacity exp(-1/2 d^T M^-1 d)), d from the projected centre to the pixel, skipped below 1/255; tau = -ln(1 - alpha).
-    The normal is the axis of the smallest extent (the first of equal ones), turned towards the camera. Left out:
-    z <= near, and det M <= 1e-12 trace(M)^2.
+    `ray_space_jacobian` in px, evaluated at `held_in_view`; alpha = min(0.99, opacity exp(-1/2 d^T M^-1 d)), d from the
+    projected centre to the pixel, skipped below 1/255; tau = -ln(1 - alpha). The normal is the axis of the smallest
+    extent (the first of equal ones), turned towards the camera. Left out: z <= near, and det M <= 1e-12 trace(M)^2.
 
     Args:
         extent: (N, 3) standard deviations >= 0; the rest as for `polyhedron_chords`.
-        opacity: (N,), of the peak.
+        opacity: (N,), peak opacity.
         screen_filter: px^2, added to the variances; 0.3 in the source.
 
     Accuracy:
-        M and alpha are double whatever the dtype, so that the test of det means the same everywhere.
+        M and alpha are double for every dtype, so that the test of det gives the same result everywhere.
 
     Source: Kerbl et al., 3D Gaussian Splatting (2023).
     """

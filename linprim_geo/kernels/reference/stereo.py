@@ -1,5 +1,5 @@
-"""The cost of planes in PatchMatch stereo, what `stereo_ops.patch_match` begins with, `stereo_ops.support`,
-`stereo_ops.fit_surfaces`, and `stereo_ops.compare_shading`, in float64."""
+"""Reference implementation, in float64, of the matching cost of planes with which `stereo_ops.patch_match` begins, of
+`stereo_ops.support`, `stereo_ops.fit_surfaces` and `stereo_ops.compare_shading`."""
 
 from __future__ import annotations
 
@@ -7,30 +7,31 @@ import numpy as np
 
 from linprim_geo.geometry.camera import Camera
 
-# Samples of the window: so many per side, two pixels apart; standard deviations of its weights in pixels; the cost of
-# what cannot be compared.
+# Samples of the window per side, two pixels apart; standard deviation of the spatial weights in pixels; cost of what
+# cannot be compared.
 SIDE, NEAR_PIXELS, WORST = 6, 5.0, 2.0
-# Standard deviations in grey values, from the narrowest, and how many of them a sample may be off; the share of the
-# window that has to be like the pixel, and the variance that it needs, in that of the noise.
+# Standard deviations of the bilateral weights in grey values, from the narrowest; number of these by which a sample may
+# differ; share of the window that must resemble the centre pixel; variance that the window needs, relative to that of
+# the noise.
 NEAR_GREYS, FAR_GREY, OWN_SHARE, INFORMED = (10.0, 25.0, 60.0), 2.5, 0.5, 4.0
-# Pixels to both sides between which the derivative of a mapping is taken.
+# Offsets in pixels for the central difference of a mapping.
 STEP = np.array([-1e-4, 1e-4])
-# How far the cross of `support` reaches, in pixels, and where it ends, in grey values.
+# Reach of the cross of `support` in pixels, and the difference in grey values that ends it.
 CROSS_REACH, CROSS_GREY = 10, 25
-# `fit_surfaces` tries the planes in every CANDIDATE_STEP-th row and column of a cross, by SCALES tolerances, each half
-# of the one before; it fits to FEWEST_FITTED pixels at least, in FIT_ROUNDS; terms are dropped of which earlier ones
-# leave less than TERM_LEFT of the sum of squares.
+# `fit_surfaces` tries the planes in every CANDIDATE_STEP-th row and column of a cross, with SCALES tolerances, each
+# half of the previous one. It fits to at least FEWEST_FITTED pixels, in FIT_ROUNDS rounds. A term is dropped if earlier
+# terms leave less than TERM_LEFT of its sum of squares.
 CANDIDATE_STEP, SCALES, FEWEST_FITTED, FIT_ROUNDS, TERM_LEFT = 5, 4, 12, 2, 1e-6
 
-# Of `compare_shading`: the range of gains, and rounds of weights.
+# For `compare_shading`: the range of gains, and the number of reweighting rounds.
 GAINS, ROUNDS = (0.7, 1.4), 3
 
 
 def match_cost(
     camera: Camera, grey: np.ndarray, other: Camera, other_grey: np.ndarray, plane: np.ndarray, noise: float
 ) -> np.ndarray:
-    """(H, W) 1 - normalised cross correlation of windows along (H, W, 3) planes of inverse depth, 0 to 2. A plane maps
-    a window by its derivative at the middle."""
+    """Return (H, W) costs, 1 - normalised cross-correlation of windows along (H, W, 3) planes of inverse depth, 0 to 2.
+    A plane maps a window by its derivative at the centre."""
     height, width = grey.shape
     offset = np.arange(1 - SIDE, SIDE, 2)
     down, right = (x.ravel() for x in np.meshgrid(offset, offset, indexing="ij"))
@@ -60,7 +61,7 @@ def match_cost(
 
 
 def _window(own: np.ndarray, middle: float, near: np.ndarray, noise: float, plain: bool) -> np.ndarray:
-    """Weights of a window's grey values, of sum 1. `plain`: no edge runs through its middle."""
+    """Return the weights of a window's grey values, with sum 1. `plain`: no edge passes through its centre."""
     for spread in NEAR_GREYS:
         away = np.abs(own - middle) / spread
         weight = np.where(away > FAR_GREY, 0, np.exp(-0.5 * away**2)) * near
@@ -75,7 +76,8 @@ def _window(own: np.ndarray, middle: float, near: np.ndarray, noise: float, plai
 
 
 def _pixels(camera: Camera, other: Camera, column: np.ndarray, row: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """(N, 2) places in another image, 0 at the middle of its first pixel, of pixels at inverse depths."""
+    """Return (N, 2) positions in another image, with 0 at the centre of its first pixel, of pixels at inverse
+    depths."""
     rays = np.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(len(row))])
     pose = other.world_to_camera @ np.linalg.inv(camera.world_to_camera)
     p = pose[:3, :3] @ rays + pose[:3, 3:] * inverse
@@ -93,7 +95,7 @@ def _bilinear(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 
 def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray:
-    """(H, W) share of the pixels that belong to each that go on with its surface, see `stereo_ops.support`."""
+    """Return (H, W) shares of the pixels in each pixel's cross that continue its surface, see `stereo_ops.support`."""
     height, width = grey.shape
     grey, plane = grey.astype(int), plane.astype(np.float64)
     share = np.zeros(grey.shape)
@@ -111,8 +113,8 @@ def support(grey: np.ndarray, plane: np.ndarray, tolerance: float) -> np.ndarray
 def fit_surfaces(
     grey: np.ndarray, plane: np.ndarray, cost: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(3, H, W) planes and (H, W) costs that `stereo_ops.fit_surfaces` makes of (3, H, W) ones, whose inverse depth is
-    0 where it is unknown."""
+    """Return the (3, H, W) planes and (H, W) costs that `stereo_ops.fit_surfaces` computes from (3, H, W) planes, whose
+    inverse depth is 0 where unknown."""
     grey, plane = grey.astype(int), plane.astype(np.float64)
     fitted, fitted_cost = plane.copy(), cost.astype(np.float64)
     tolerances = tolerance / 2.0 ** np.arange(SCALES)
@@ -154,7 +156,7 @@ def fit_surfaces(
 
 
 def _least_squares(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(T,) coefficients of (N, T) terms, 0 for those that earlier ones explain."""
+    """Return (T,) coefficients of (N, T) terms, 0 for terms that earlier ones explain."""
     kept: list[int] = []
     for k, column in enumerate(terms.T):
         left = column - terms[:, kept] @ np.linalg.lstsq(terms[:, kept], column, rcond=None)[0] if kept else column
@@ -166,13 +168,13 @@ def _least_squares(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _cross(grey: np.ndarray, row: int, column: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels that belong to one."""
+    """Return the rows and columns of the pixels in the cross of a pixel."""
     y, x = np.array([(y, x) for y in _alike(grey[:, column], row) for x in _alike(grey[y], column)]).T
     return y, x
 
 
 def _alike(line: np.ndarray, middle: int) -> range:
-    """The places along a line of grey values, around the middle, that belong to it."""
+    """Return the range of positions along a line of grey values, around the middle, that belong to its cross."""
     ends = []
     for step in (-1, 1):
         place = middle
@@ -196,7 +198,8 @@ def compare_shading(
     means: np.ndarray,
     plain: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float, float, np.ndarray, np.ndarray]:
-    """`shown`, `left`, `left_variance`, `variance`, `information` and `downhill` of `stereo_ops.ShadedComparison`."""
+    """Return `shown`, `left`, `left_variance`, `variance`, `information` and `downhill` of
+    `stereo_ops.ShadedComparison`."""
     points = own.center + (rays / (rays @ plane)[:, None]) @ own.rotation
     pixels, along = other.project(points)
     height, width = plain.shape
@@ -236,7 +239,7 @@ def compare_shading(
 
 
 def _at(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Bilinear values of an image at pixels, whose middles are at +0.5."""
+    """Return bilinear values of an image at positions; pixel centres are at +0.5."""
     x, y = (pixels - 0.5).T
     left, top = np.floor(x).astype(int), np.floor(y).astype(int)
     u, v = x - left, y - top
