@@ -1,4 +1,5 @@
-// Files that are compiled once per instruction set give functions name_scalar, name_v2 and so on; the one in force.
+// Selects between the copies of a function in files that are compiled once per instruction set (name_scalar, name_v2,
+// ...).
 #pragma once
 
 #include <cstring>
@@ -20,14 +21,14 @@
 
 namespace linprim {
 
-// A function that gives a kernel, and the instruction set that it is compiled for.
+// A function that returns a kernel, and the instruction set that it is compiled for.
 template <class Kernel>
 struct Copy {
   const char* instruction_set;
   Kernel (*kernel)();
 };
 
-// The kernel of `copies`, which are LINPRIM_COPIES(name), for the instruction set in force.
+// Returns the kernel in `copies`, which is LINPRIM_COPIES(name), for the instruction set in use.
 template <class Kernel>
 Kernel kernel_in_force(std::initializer_list<Copy<Kernel>> copies) {
   for (const Copy<Kernel>& copy : copies)

@@ -1,4 +1,4 @@
-// The kinds of primitives: what the core knows of each apart from its kernels. A new kind is an enumerator, a row of
+// The kinds of primitives and their properties outside of the kernels. To add a kind, add an enumerator, a row of
 // kKindTraits, and a row of the table in raster/kernels.cpp.
 #pragma once
 
@@ -7,16 +7,16 @@
 
 namespace linprim {
 
-// Numbers cross into Python, whose `KINDS` has the same order.
+// The numbers are used in Python too, whose `KINDS` has the same order.
 enum class PrimitiveKind : int { kOctahedron, kTetrahedron, kGaussian };
 constexpr int kKinds = 3;
 
-// A solid about its centre as the intersection of four slabs |normal . x + shift| <= 1, and its box along the axes.
+// A polyhedron about its centre, as the intersection of four slabs |normal . x + shift| <= 1, and its axis-aligned box.
 struct Slabs {
   double normal[4][3], shift[4], low[3], high[3];
 };
 
-// |sum_k s_k (R^T x)_k / extent_k| <= 1 for the four sign patterns of which no two are opposite.
+// sum_k s_k (R^T x)_k / extent_k| <= 1 for four sign patterns s, one of each pair of opposite ones.
 inline void octahedron_slabs(const double r[3][3], const double* extent, Slabs& out) {
   constexpr double kSigns[4][3] = {{1, 1, 1}, {1, 1, -1}, {1, -1, 1}, {-1, 1, 1}};
   for (int i = 0; i < 3; ++i) {
@@ -56,16 +56,16 @@ inline void tetrahedron_slabs(const double r[3][3], const double* extent, Slabs&
 }
 
 struct KindTraits {
-  // Numbers of its extent: half-axes, vertex distances or standard deviations.
+  // Number of extents: half-axes, vertex distances or standard deviations.
   int extents;
-  // Its faces, with positive extents and the local axes for columns of r; null where there are none.
+  // Computes its faces from positive extents and the local axes in the columns of r; null for kinds without faces.
   void (*slabs)(const double r[3][3], const double* extent, Slabs& out);
 };
 // In the order of PrimitiveKind.
 constexpr KindTraits kKindTraits[kKinds] = {{3, octahedron_slabs}, {4, tetrahedron_slabs}, {3, nullptr}};
 
 constexpr const KindTraits& traits_of(PrimitiveKind kind) { return kKindTraits[int(kind)]; }
-// Whether it has faces, where rays enter and leave.
+// Whether the kind has faces, where rays enter and leave.
 constexpr bool is_solid(PrimitiveKind kind) { return traits_of(kind).slabs != nullptr; }
 
 }  // namespace linprim

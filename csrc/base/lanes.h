@@ -1,5 +1,5 @@
-// Several primitives at a time in double precision: the lane types of the per-primitive stages, and moving their
-// results to rows.
+// SIMD lanes in double precision for the per-primitive stages, which process several primitives at a time, and the
+// transposition of their results to rows.
 #pragma once
 
 #include <cmath>
@@ -21,7 +21,7 @@ constexpr int kLanes = 1;
 constexpr int kLanes = 2;
 #endif
 typedef double D __attribute__((vector_size(8 * kLanes)));
-typedef int64_t B __attribute__((vector_size(8 * kLanes)));  // what a comparison of D gives: all ones or 0 per lane
+typedef int64_t B __attribute__((vector_size(8 * kLanes)));  // result of comparing D: all ones or 0 per lane
 
 inline D splat(double x) { return x - D{}; }
 inline D vmin(D a, D b) { return a < b ? a : b; }
@@ -54,7 +54,7 @@ inline B ceil_of(D x) {
 }
 inline D clamp(D x, double low, double high) { return vmin(vmax(x, splat(low)), splat(high)); }
 
-// base[rows[l] * stride] of each lane.
+// Loads base[rows[l] * stride] into each lane l.
 template <class Real>
 inline D gather(const Real* base, int64_t stride, const int64_t* rows) {
   D r;
@@ -62,7 +62,7 @@ inline D gather(const Real* base, int64_t stride, const int64_t* rows) {
   return r;
 }
 
-// first[l * stride + i] = values[i][l] for i < count and l < lanes: lanes become rows.
+// Transposes lanes to rows: first[l * stride + i] = values[i][l] for i < count and l < lanes.
 template <class Real>
 inline void to_rows(Real* first, int64_t stride, const D* values, int count, int lanes) {
   int done = 0;

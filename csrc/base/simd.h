@@ -1,14 +1,15 @@
-// Vectors of W floats (or doubles) at the machine's native width, for code that is compiled once per instruction set.
+// SIMD vectors of W floats (or doubles) at the machine's native width, for code that is compiled once per instruction
+// set.
 //
-// Included only by files that are built per instruction set: everything lives in namespace linprim::LINPRIM_ISA, so
-// that no inline function built for one instruction set can be linked into the path of another.
+// Included only by files that are built per instruction set. Everything is in namespace linprim::LINPRIM_ISA, so that
+// no inline function built for one instruction set can be linked into the code of another.
 //
 //   Vec<T, W>   W lanes of T        + - * fma min max rcp exp_neg
 //   Mask<T, W>  W booleans          & | bits all
 //   Index<T, W> W small integers    select lookup8 equal is_face
 //
-// Only operations whose result IEEE 754 fixes: rcp is a division, rounded correctly. The processors' estimates of a
-// reciprocal or of its square root differ between makers, and with them every bit that is trained.
+// Only operations whose result IEEE 754 defines are used: rcp is a correctly rounded division. Hardware estimates of
+// reciprocals and reciprocal square roots differ between processor makers, and would change every trained bit.
 #pragma once
 
 #include <cmath>
@@ -92,7 +93,7 @@ inline void exp_neg(Vec<T, 1> x, Vec<T, 1>& alpha, Vec<T, 1>& transmittance) {
   alpha.v = -std::expm1(-x.v);
   transmittance.v = std::exp(-x.v);
 }
-// An integer per lane, carried along a min or max to remember which face won.
+// An integer per lane, updated along with a min or max to record which face gave it.
 template <class T, int W>
 struct Index;
 template <class T>
@@ -342,7 +343,7 @@ inline void exp_neg(V x, V& alpha, V& transmittance) {
   alpha = (V::set(1.0f) - s) - sf;
 }
 
-// Which of up to 32 masks have bit `bit`, as bits of the result.
+// Returns bit `bit` of up to 32 masks, as the bits of the result.
 inline uint32_t column(const uint32_t* masks, int count, int bit) {
 #if defined(LINPRIM_ISA_V4)
   const __m512i wanted = _mm512_set1_epi32(1 << bit);

@@ -1,4 +1,4 @@
-// What every part of the core shares: the camera, primitives and their records, the planes of an image.
+// Types shared by all parts of the core: the view, primitives and their gradients, image planes.
 #pragma once
 
 #include <cstddef>
@@ -16,19 +16,19 @@ constexpr int kMaxShCoefficients = 16;      // degree 3
 constexpr int kColorSums = 16;              // gradient sums per (tile, primitive) pair, see Sum
 constexpr int kGeometrySums = 32;           // the same with the entry normals' sums (28 used)
 
-// What the tile kernels are compiled for beside the kind of primitive, the scalar and the set of outputs. Numbers cross
-// into Python.
+// The tile kernels are compiled for each of these choices, besides the kind of primitive, the scalar type and the set
+// of outputs. The numbers are used in Python too.
 //
-// Exact perspective, or the rays of one primitive parallel in the ray space of its centre (EWA). A Gaussian knows only
-// the latter.
+// Ray model: exact perspective, or affine: rays within a primitive are parallel in the ray space of its centre (EWA).
+// Gaussians are always affine.
 enum class RayModel : int { kExact, kAffine };
 constexpr int kRayModels = 2;
-// Primitives blended one after another by the depth of their centres, or by each ray's entry; or absorbing where they
-// are, overlaps included.
+// Blending order: by the depth of the centres; by each ray's entry depth; or overlap, where densities add up and no
+// order is needed.
 enum class Order : int { kCenter, kEntry, kOverlap };
 constexpr int kOrders = 3;
 
-// A pinhole camera and what a ray does. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+// A pinhole camera and the parameters of its rays. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
 struct View {
   double world_to_camera[12];  // 3x4, row major, rigid
   double fx, fy, cx, cy;       // pixels
@@ -53,29 +53,29 @@ struct Primitives {
 };
 
 // Gradients with the layout of Primitives. screen (n,3): the gradient to the centre's position in pixels, and the sum
-// over tiles of the lengths of each tile's part of it, which does not cancel where a texture pulls a large primitive
-// both ways.
+// over tiles of the norm of each tile's contribution, which does not cancel where a texture pulls a large primitive in
+// opposite directions.
 template <class Real>
 struct PrimitiveGradients {
   Real *center, *rotation, *extent, *density, *sh, *screen;
 };
 
-// Order of the gradient sums of a pair. The first twelve are the kind's own (see its add_gradient); then density and
-// colour; with geometry also the gradient to the unit normals of slots 0-3 and to the distance of the centre that
-// depths count from.
+// Order of the gradient sums of a (tile, primitive) pair. The first twelve depend on the kind (see its add_gradient);
+// then density and colour; with geometry also the gradient to the unit normals of slots 0-3 and to the distance of the
+// centre, from which depths are measured.
 struct Sum {
   static constexpr int g = 0, density = 12, rgb = 13, normal = 16, distance = 28;
 };
 
-// Where a primitive can be seen: the inclusive box of pixels (empty: x1 < x0) and half-planes
-// a + b (x - ref_x) + c (y - ref_y) > 0 whose intersection with the box holds its silhouette. `a` is already raised
-// so that the test at a block's first pixel is the test of the block's most favourable pixel.
+// Screen bounds of a primitive: the inclusive box of pixels (empty: x1 < x0) and half-planes a + b (x - ref_x) + c (y -
+// ref_y) > 0 whose intersection with the box contains its silhouette. `a` is already raised so that testing a block's
+// first pixel tests the block's most favourable pixel.
 struct Footprint {
   int32_t x0, x1, y0, y1, ref_x, ref_y;
   float a[6], b[6], c[6];
 };
 
-// Image planes of H x W. Null pointers are allowed only where said.
+// Image planes of H x W. Null pointers are allowed only where stated.
 template <class Real>
 struct Planes {
   Real *rgb, *opacity;                                                                      // (3,H,W), (H,W)

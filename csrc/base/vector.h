@@ -21,7 +21,7 @@ inline void add(Vector& a, double factor, const Vector& b) {
   for (int axis = 0; axis < 3; ++axis) a[axis] += factor * b[axis];
 }
 
-// Scales to length 1; 0 stays 0. Returns the length.
+// Normalises to length 1; 0 stays 0. Returns the original length.
 inline double normalize(Vector& v) {
   const double length = std::sqrt(dot(v, v));
   if (length > 0)

@@ -1,4 +1,4 @@
-// Arrays of Python as the core takes them, with their shapes checked.
+// Python arrays as the core expects them, and checks of their shapes.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -35,7 +35,8 @@ auto checked(const Array& array, std::initializer_list<int64_t> shape, const cha
   return array.data();
 }
 
-// Rows of another array, of what is called `of`, in an array of `shape`, all of them from `least` to below `end`.
+// Returns an array of `shape` that holds row indices into another array, called `of`; throws unless all lie from
+// `least` to below `end`.
 template <class T>
 const T* rows_of(const In<T>& array, std::initializer_list<int64_t> shape, int64_t end, const char* name,
                  const char* of = "vertices", int64_t least = 0) {

@@ -1,4 +1,5 @@
-// The parts of the module; each checks shapes, releases the interpreter lock, calls the core. No arithmetic in them.
+// Parts of the Python module. Each checks shapes, releases the interpreter lock and calls the core; there is no
+// arithmetic in them.
 #pragma once
 
 #include <nanobind/nanobind.h>

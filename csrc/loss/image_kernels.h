@@ -1,6 +1,6 @@
 // L1 + D-SSIM with its gradient, and Adam.
 //
-// SSIM as in 3DGS: 11x11 Gaussian window of sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over
+// SSIM as in 3DGS: 11x11 Gaussian window with sigma 1.5, zeros beyond the border, C1 = 0.01^2, C2 = 0.03^2, mean over
 // pixels. Included by kernels.cpp only.
 #pragma once
 
@@ -21,7 +21,7 @@ constexpr float kWindow[kSsimRadius + 1] = {0.26601171493530273f, 0.213005527853
                                             0.03600077331066132f, 0.00759875820949674f, 0.0010283800877257609f};
 constexpr int kTaps = 2 * kSsimRadius + 1;
 
-// Rows of kMaps maps in groups of kSsimRows; three consecutive groups are kept, enough to blur the middle one along y.
+// Rows of kMaps maps in groups of kSsimRows. Three consecutive groups are kept, enough to blur the middle one along y.
 template <int kMaps>
 struct RowGroups {
   float* memory;
@@ -32,8 +32,8 @@ struct RowGroups {
   static int64_t size(int64_t pitch) { return kMaps * 3 * kSsimRows * pitch; }
 };
 
-// Columns [begin, end) of kSsimRows consecutive rows of one map, blurred along y; `rows` are those from kSsimRadius
-// above the first to kSsimRadius below the last. A row is loaded once for all the rows it goes into.
+// Blurs columns [begin, end) of kSsimRows consecutive rows of one map along y; `rows` are those from kSsimRadius above
+// the first to kSsimRadius below the last. Each row is loaded once for all output rows that it contributes to.
 template <int W>
 inline void blur_rows(const float* const* rows, float* __restrict out, int64_t pitch, int begin, int end) {
   using V = Vec<float, W>;
@@ -55,7 +55,7 @@ inline void blur_rows(const float* const* rows, float* __restrict out, int64_t p
   }
 }
 
-// W pixels blurred along x, the first at `center`; two sums, as one is a long chain.
+// Blurs W pixels along x, the first at `center`; with two sums, because one would be a long dependency chain.
 template <int W>
 inline Vec<float, W> blur_along(const float* center) {
   using V = Vec<float, W>;
@@ -70,15 +70,15 @@ inline Vec<float, W> blur_along(const float* center) {
   return even + odd;
 }
 
-// The four maps that SSIM takes the mean of, of image a and target b; with d = a - b instead of b and a b, what is
-// small where the images agree is not a difference of large numbers.
+// The four maps whose means SSIM needs, of image a and target b. With d = a - b instead of b and a b, values that are
+// small where the images agree are not differences of large numbers.
 struct Moment {
   static constexpr int kImage = 0, kDifference = 1, kSquares = 2 /* a^2 + b^2 */, kDifferenceSquare = 3, kCount = 4;
 };
-// The gradient of the SSIM part to the image is D0 + a D1 + d D2, each blurred from what ssim_row writes.
+// The gradient of the SSIM part to the image is D0 + a D1 + d D2, each blurred from the output of ssim_row.
 constexpr int kDerivatives = 3;
 
-// A row of the four maps, from pixel `left` of the image on, in columns [0, pitch); 0 outside the image.
+// Writes a row of the four maps, starting at pixel `left` of the image, in columns [0, pitch); 0 outside the image.
 template <int W>
 inline void moment_row(const float* image, const float* target, int width, int left, int64_t pitch,
                        const RowGroups<Moment::kCount>& out, int row) {
@@ -98,8 +98,9 @@ inline void moment_row(const float* image, const float* target, int width, int l
   columns(Vec<float, 1>{}, columns(Vec<float, W>{}, begin, end), end);
 }
 
-// Columns [begin, end) of a row: takes the row's maps blurred along y, blurs them along x, and writes the derivatives
-// of weight (1 - SSIM), to be blurred in turn; adds the columns' sums of weight times |a - b|, (a - b)^2 and 1 - SSIM.
+// For columns [begin, end) of a row: takes the row's maps blurred along y, blurs them along x, and writes the
+// derivatives of weight (1 - SSIM), which are then blurred in turn; adds the columns' sums of weight times |a - b|, (a
+// - b)^2 and 1 - SSIM.
 //
 // With the means A, B, their difference D = A - B, M = A^2 + B^2 and V the sum of both variances: 1 - SSIM = 1 - a1 a2
 // / (b1 b2), b1 = M + C1, a1 = b1 - D^2, b2 = V + C2, a2 = b2 - (variance of a - b).
@@ -119,7 +120,7 @@ inline void ssim_row(const float* const* blurred, const float* difference, const
     const V inverse = rcp(b1 * b2), scaled = w * inverse;
     const V lost = fma(b1, variance, a2 * dd) * inverse;  // 1 - SSIM
     const V twice = two * scaled;
-    // d SSIM / dA = 2 (B (a2 - a1) + A SSIM (b1 - b2)) / (b1 b2); the two others likewise, to a^2 + b^2 and (a - b)^2.
+    // d SSIM / dA = 2 (B (a2 - a1) + A SSIM (b1 - b2)) / (b1 b2); similarly the other two, to a^2 + b^2 and (a - b)^2.
     (twice * fma(b2 - b1, d - a * lost, b * (variance - dd))).store(derivative[0] + x);
     (zero - twice * a1 * variance * b1 * inverse).store(derivative[1] + x);
     (twice * a1).store(derivative[2] + x);
@@ -131,7 +132,7 @@ inline void ssim_row(const float* const* blurred, const float* difference, const
   sums[0] += sum(l1), sums[1] += sum(square), sums[2] += sum(off);
 }
 
-// Columns [begin, end) of the gradient, from the derivatives blurred along y.
+// Writes columns [begin, end) of the gradient, from the derivatives blurred along y.
 template <int W>
 inline void gradient_row(const float* const* blurred, const float* image, const float* difference, const float* weight,
                          float l1_scale, float ssim_scale, float* out, int begin, int end) {
@@ -146,9 +147,9 @@ inline void gradient_row(const float* const* blurred, const float* image, const 
   }
 }
 
-// Loss sums and gradient of rows [begin, end) and one tile of columns of a channel in one sweep: blur, SSIM and its
-// derivatives, and their blur again (the window is symmetric and zeros lie beyond the border, so the blur is its own
-// adjoint). Rows and columns around the part are computed as well; every row's results are the same wherever the part
+// Loss sums and gradient of rows [begin, end) and one tile of columns of a channel in one pass: blur, SSIM and its
+// derivatives, and the blur of these (the window is symmetric and zeros lie beyond the border, so the blur is its own
+// adjoint). Rows and columns around the part are computed too; the results of a row do not depend on where the part
 // begins.
 template <int W>
 inline void photometric(const PhotometricParams& P, int channel, int tile, int begin, int end, float* buffer,
@@ -159,8 +160,8 @@ inline void photometric(const PhotometricParams& P, int channel, int tile, int b
   const int64_t pitch = photometric_pitch(width), plane = int64_t(width) * height;
   const float *image = P.image + channel * plane, *target = P.target + channel * plane;
   const float l1_scale = float((1.0 - P.dssim) / P.weight_sum), ssim_scale = float(P.dssim / P.weight_sum);
-  // Local columns, kPad more than those from `left`: of the part, of its derivatives, which are 0 beyond the image, and
-  // of what they need.
+  // Local columns, which start kPad before `left`: of the part, of its derivatives, which are 0 beyond the image, and
+  // of the inputs that these need.
   const int first = kPad, last = kPad + (right - left + kSsimAlign - 1) / kSsimAlign * kSsimAlign;
   const int outer_first = left > 0 ? first - kSsimAlign : first, outer_last = right < width ? last + kSsimAlign : last;
   buffer += (kSsimAlign - reinterpret_cast<uintptr_t>(buffer) / sizeof(float) % kSsimAlign) % kSsimAlign;
@@ -178,7 +179,7 @@ inline void photometric(const PhotometricParams& P, int channel, int tile, int b
       std::copy_n(P.weight + int64_t(row) * width + left - kPad + inside_first, inside_last - inside_first,
                   weights + inside_first);
   };
-  // Columns [from, to) of all rows of a group, blurred along y.
+  // Blurs columns [from, to) of all rows of a group along y.
   auto blur_group = [&](const auto& groups, int maps, int group, int from, int to) {
     for (int m = 0; m < maps; ++m) {
       const float* rows[kSsimRows + 2 * kSsimRadius];
@@ -246,8 +247,8 @@ inline void adam(const AdamParams& P, int64_t begin, int64_t end) {
   }
 }
 
-// N of a row's elements in W lanes. No byte beyond them is touched, not even under a mask: a load of the next row would
-// then have to wait for this row's store.
+// Updates N of a row's elements in W lanes. No byte beyond them is accessed, not even under a mask: a load of the next
+// row would then have to wait for this row's store.
 template <int W, int N = W>
 inline void adam_part(const AdamRowsParams& P, const RowTensor& t, int64_t at, float step, float root) {
   using V = Vec<float, W>;
@@ -283,15 +284,15 @@ inline void adam_part(const AdamRowsParams& P, const RowTensor& t, int64_t at, f
   store(load(t.value) - V{(V::set(step) * first).v / divisor.v}, t.value);
 }
 
-// Whether any value is not 0; NaN is not.
+// Returns whether any value is not 0; NaN counts as not 0.
 inline bool any_nonzero(const float* values, int64_t n) {
   uint32_t bits = 0;
   for (int64_t k = 0; k < n; ++k) bits |= std::bit_cast<uint32_t>(values[k]) << 1;  // without the sign
   return bits != 0;
 }
 
-// Adam on the touched ones of rows [begin, end), each by its own count of steps; at most kAdamRows rows. Tensor after
-// tensor, as the processor can only follow a few streams of memory.
+// Adam on the touched rows among [begin, end), each with its own step count; at most kAdamRows rows. Processed tensor
+// by tensor, because the processor can prefetch only a few memory streams.
 template <int W>
 inline void adam_rows(const AdamRowsParams& P, int64_t begin, int64_t end) {
   constexpr int kLine = 16, kAhead = 6;

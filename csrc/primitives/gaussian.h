@@ -1,15 +1,15 @@
-// A Gaussian: how a tile kernel meets 3D Gaussian splatting's projected ellipse, how it is projected to a record for
-// that, and the adjoints of both.
+// Gaussians: how a tile kernel evaluates the projected ellipse of 3D Gaussian splatting, how a Gaussian is projected to
+// a record for that, and the backward passes of both.
 //
-// Not a solid: it has an alpha per pixel and one depth, that of its centre. alpha = min(0.99, opacity exp(-d^T Q d /
-// 2)), nothing below 1/255, d the pixel's offset from the projected centre and Q the inverse of the projected
-// covariance. Source: Kerbl et al. 2023 (arXiv 2308.04079), sections 4 and 6; the two limits are those of its appendix
-// C.
+// A Gaussian is not a solid: it has an alpha per pixel and a single depth, that of its centre. alpha = min(0.99,
+// opacity exp(-d^T Q d / 2)), nothing below 1/255, with d the pixel's offset from the projected centre and Q the
+// inverse of the projected covariance. Source: Kerbl et al. 2023 (arXiv 2308.04079), sections 4 and 6; the two limits
+// are those of its appendix C.
 //
-// The covariance sum_k arm_k arm_k^T (arm_k the local axis k times its standard deviation) is projected by the Jacobian
-// of the pixel position at the centre, or, far outside of the image, where it would run away, at the nearest place in a
-// margin around it: with g_k = J arm_k, M = sum_k g_k g_k^T + filter I.  Source: Zwicker et al. 2002; Kerbl et al.
-// 2023, equation 5.
+// The covariance sum_k arm_k arm_k^T (arm_k is the local axis k times its standard deviation) is projected with the
+// Jacobian J of the pixel position at the centre; for centres far outside of the image, where J diverges, at the
+// nearest position within a margin around it. With g_k = J arm_k, M = sum_k g_k g_k^T + filter I. Source: Zwicker et
+// al. 2002; Kerbl et al. 2023, equation 5.
 #pragma once
 
 #include "base/simd.h"
@@ -17,7 +17,7 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// As the tile kernels read it.
+// A projected Gaussian as the tile kernels read it.
 template <class Real>
 struct alignas(16) GaussianRecord {
   Real xx, xy, yy;           // inverse covariance, 1 / pixel^2
@@ -64,7 +64,7 @@ struct Gaussian {
   }
   static void depths(const Record& r, V, const Meeting&, V& t_in, V& t_out) { t_in = t_out = V::set(r.w0); }
 
-  // With g the gradient to the exponent: the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the
+  // With g the gradient to the exponent: adds the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the
   // gradient to -ln(1 - alpha).
   template <class Kind, bool kDistance>
   static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V,
@@ -80,7 +80,7 @@ struct Gaussian {
   static void recenter(const Record&, Real, Real, Real*) {}
 };
 
-// A covariance whose determinant is below this part of its squared trace is a line, and not drawn.
+// A projected covariance whose determinant is below this share of its squared trace is a line and not drawn.
 constexpr double kFlat = 1e-12;
 
 struct GaussianFrame {
@@ -111,7 +111,7 @@ struct GaussianFrame {
       gy[k] = view.fy * (pose.axis[k][1] - limit_v * pose.axis[k][2]) * inverse_z * extent[k];
       xx += gx[k] * gx[k], xy += gx[k] * gy[k], yy += gy[k] * gy[k];
     }
-    // Cauchy and Binet: without the cancellation of xx yy - xy^2.
+    // By the Cauchy-Binet formula, without the cancellation of xx yy - xy^2.
     const D trace = xx + yy,
             across[3] = {gx[1] * gy[2] - gx[2] * gy[1], gx[2] * gy[0] - gx[0] * gy[2], gx[0] * gy[1] - gx[1] * gy[0]};
     determinant = dot(across, across) + view.screen_filter * (trace - view.screen_filter);
@@ -143,8 +143,8 @@ void project_gaussians(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     const D opacity = clamp(gather(P.primitives.density, 1, rows), 0.0, 1.0);
     const D x = view.fx * f.u + (view.cx - 0.5), y = view.fy * f.v + (view.cy - 0.5);
 
-    // Where alpha reaches 1/255: d^T Q d = reach^2 = 2 ln(255 opacity), inside +-reach sqrt(M_xx) and, along a unit
-    // vector e, +-reach sqrt(e^T M e).
+    // alpha is at least 1/255 where d^T Q d <= reach^2 = 2 ln(255 opacity): within +-reach sqrt(M_xx) along x and,
+    // along a unit vector e, within +-reach sqrt(e^T M e).
     D reach{};
     for (int l = 0; l < kLanes; ++l)
       reach[l] = opacity[l] > kSmallestAlpha ? std::sqrt(2 * std::log(opacity[l] / kSmallestAlpha)) : 0.0;
@@ -162,7 +162,7 @@ void project_gaussians(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     const D ref_x = __builtin_convertvector(floor_of(clamp(x, -4e6, 4e6) + 0.5), D),
             ref_y = __builtin_convertvector(floor_of(clamp(y, -4e6, 4e6) + 0.5), D);
     const D mean_x = x - ref_x, mean_y = y - ref_y;
-    // The ellipse's two principal directions bound it by four half-planes.
+    // Four half-planes perpendicular to the ellipse's principal directions bound it.
     const D middle = 0.5 * (f.xx + f.yy), swing = vsqrt(0.25 * (f.xx - f.yy) * (f.xx - f.yy) + f.xy * f.xy);
     D ex = f.xx >= f.yy ? f.xx - f.yy + 2.0 * swing : 2.0 * f.xy,
       ey = f.xx >= f.yy ? 2.0 * f.xy : f.yy - f.xx + 2.0 * swing;

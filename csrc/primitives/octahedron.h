@@ -1,5 +1,5 @@
-// An octahedron: how a tile kernel meets it (entry and exit of the rays of 16, 8, 4 or 1 pixels), how it is projected
-// to a record for that, and the adjoints of both.
+// Octahedra: how a tile kernel intersects them (entry and exit of the rays of 16, 8, 4 or 1 pixels), how an octahedron
+// is projected to a record for that, and the backward passes of both.
 #pragma once
 
 #include "primitives/polyhedron.h"
@@ -7,8 +7,8 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// As the tile kernels read it. Slots 0-3 hold, of each pair of opposite faces, the one turned to the camera; slots 4-7
-// their opposites, always back faces.
+// A projected octahedron as the tile kernels read it. Slots 0-3 hold, of each pair of opposite faces, the one turned to
+// the camera; slots 4-7 hold their opposites, which are always back faces.
 template <class Real>
 struct alignas(64) OctahedronRecord {
   Real a[8], b[8], c[8];  // planes of the faces, see polyhedron.h
@@ -30,8 +30,8 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   using I = typename Base::I;
   using Meeting = typename Base::Meeting;
 
-  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also
-  // which faces.
+  // Computes the planes where the rays enter and leave; x and y are in pixels relative to the record's reference.
+  // kTrack: also which faces.
   template <bool kTrack>
   static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
     auto value = [&](int f) { return fma(V::set(r.b[f]), x, fma(V::set(r.c[f]), y, V::set(r.a[f]))); };
@@ -43,7 +43,7 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
       if constexpr (kTrack) m.out_face = select(m.out < w, I::set(f), m.out_face);
       m.out = max(w, m.out);
     };
-    // Under affine rays each pair of opposite faces has one that is turned to the camera, and nothing is cut.
+    // With affine rays, one face of each pair is turned to the camera, and nothing is cut at the near plane.
     if (kRays == RayModel::kAffine || !(r.flags & kGeneral)) [[likely]] {
       if constexpr (kTrack) {
         m.in = value(0), m.out = value(4);
@@ -67,11 +67,11 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
     return m.out < m.in;
   }
 
-  // Adds gradients to the planes of entry and exit (0 in lanes without a hit) to the sums of the three local forms p_k:
-  // with g the gradient to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9; px and py are positions from the
-  // pair's origin.
+  // Accumulates the gradients of the entry and exit planes (0 in lanes without a hit) in the sums of the three local
+  // forms p_k: with g the gradient to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9. px and py are positions
+  // relative to the pair's origin.
   static void add_planes(const Record& r, const Meeting& m, M hit, V g_in, V g_out, V px, V py, V* sums) {
-    // A lane that does not hit may hold an infinity, and 0 times that is no number.
+    // A lane without a hit may hold an infinity, and 0 times infinity is NaN.
     const V zero = V::set(0), g_in_w = g_in * select(hit, m.in, zero), g_out_w = g_out * select(hit, m.out, zero);
     for (int k = 0; k < 3; ++k) {
       const V s_in = lookup8(r.face[k], m.in_face), s_out = lookup8(r.face[k], m.out_face);
@@ -82,15 +82,15 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
       sums[9 + k] = fma(g_in_w, s_in, fma(g_out_w, s_out, sums[9 + k]));
     }
   }
-  // Moves a slot's sums from their origin, a pixel of the tile, to the reference pixel.
+  // Converts a slot's sums from their origin, a pixel of the tile, to the reference pixel.
   static void recenter(const Record& r, Real origin_x, Real origin_y, Real* slot) {
     const Real dx = origin_x - r.ref_x, dy = origin_y - r.ref_y;
     for (int k = 0; k < 3; ++k) slot[3 + k] += dx * slot[k], slot[6 + k] += dy * slot[k];
   }
 };
 
-// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0 (affine: n_k . j), which an
-// octahedron does not notice; `flip` undoes it.
+// The local forms n_k = axis_k / extent_k. Axes are mirrored so that m_k = n_k . c >= 0 (affine: n_k . j), which leaves
+// the octahedron unchanged; `flip` undoes it.
 template <RayModel kRays>
 struct OctahedronFrame {
   Pose pose;
@@ -131,7 +131,7 @@ inline void pair_sums(const D v[3], D out[4]) {
   out[3] = v[1] - v[0] + v[2];
 }
 
-// Silhouette half-planes of one lane for the general path: every edge between a front and a back face.
+// Silhouette half-planes of one lane for the general path: from every edge between a front and a back face.
 inline void silhouette_lines(const D* a, const D* b, const D* c, int l, const bool front[8], const double signs[8][3],
                              D* line_a, D* line_b, D* line_c) {
   int count = 0;
@@ -189,7 +189,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
     }
     if (!any(visible)) continue;
 
-    // Local forms at the reference pixel and their steps per pixel, then the faces.
+    // Local forms at the reference pixel and their steps per pixel, then the face planes.
     D p[3], px[3], py[3], m[3], q[4], qx[4], qy[4], sigma[4];
     for (int k = 0; k < 3; ++k) {
       rays.form(f.n[k], p[k], px[k], py[k], m[k]);
@@ -344,8 +344,8 @@ void chain_octahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
           out.axis[k][i] += g * f.extent[k], out.extent[k] += g * f.pose.axis[k][i];
         }
     }
-    // Movement on the screen, whole and tile by tile, as that of the centre at its depth, or at the middle of the
-    // depths beyond the near plane.
+    // Screen-space gradients, total and per tile: as if the centre moved at its depth, or at the middle of the depths
+    // beyond the near plane.
     const D z = rays.crosses_near ? (view.near + f.pose.center[2] + f.reach_z()) * 0.5 : f.pose.center[2];
     out.screen_x = out.center[0] * z * (1.0 / view.fx), out.screen_y = out.center[1] * z * (1.0 / view.fy);
     double pull[kLanes] = {};

@@ -1,19 +1,19 @@
-// What the polyhedra have in common in a tile kernel: from the planes of entry and exit to depths and optical
-// thickness, and back.
+// Common parts of the polyhedra in a tile kernel: from the planes of entry and exit to depths and optical thickness,
+// and the backward pass.
 //
-// A tile kernel asks of a primitive kind ("Kind"):
+// A tile kernel needs from a primitive kind ("Kind"):
 //   Record, Meeting, kVolume (absorbs along an interval), kColorSums and kGeometrySums per gradient slot
-//   meet          which lanes hit, and what the functions below need to know of them
-//   thickness     what is absorbed, as `attenuate` wants it (0 in lanes without a hit)
+//   meet          which lanes hit, and the intersection data that the functions below need
+//   thickness     the absorbed amount, in the form that `attenuate` expects (0 in lanes without a hit)
 //   attenuate     thickness to alpha and transmittance
 //   depths        z-depths of entry and exit
-//   add_gradient  from the gradients to thickness and depths to the pair's sums
-//   recenter      moves a finished slot's sums from their origin to the record's reference
+//   add_gradient  from the gradients of thickness and depths to the pair's sums
+//   recenter      converts a finished slot's sums from their origin to the record's reference
 //
-// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), x and y counted in pixels,
-// with w the inverse depth less w0, the inverse depth of the reference (exact rays), or the centre's distance w0 less
-// the distance (affine rays): either way a ray is inside for w from the largest of the back faces to the smallest of
-// the front faces.
+// The faces of a polyhedron are planes w_f(x, y) = a_f + b_f (x - ref_x) + c_f (y - ref_y), with x and y in pixels. For
+// exact rays, w is the inverse depth minus w0, the inverse depth of the reference; for affine rays, the centre's
+// distance w0 minus the distance. In both cases a ray is inside for w from the largest of the back faces to the
+// smallest of the front faces.
 #pragma once
 
 #include "base/types.h"
@@ -21,11 +21,11 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// Entry index of a ray that enters through the near plane; faces are 0-7.
+// Face index for a ray that enters through the near plane; faces are 0-7.
 constexpr int kNearPlane = 8;
-// The lowest inverse depth a ray can leave at: keeps 1 / w finite.
+// Smallest inverse depth at which a ray can leave: keeps 1 / w finite.
 constexpr double kFarInverse = 1e-12;
-// Beyond every plane of a primitive under affine rays.
+// A value beyond every face plane of a primitive, for affine rays.
 constexpr double kBeyond = 1e30;
 
 template <class Real, int W, RayModel kRays>
@@ -69,15 +69,15 @@ struct Polyhedron {
       t_in = (V::set(r.w0) - m.in) * inverse, t_out = (V::set(r.w0) - m.out) * inverse;
     }
   }
-  // From the gradients to optical thickness, z-depth of entry and of exit (0 in lanes without a hit), and what the
-  // density has beside its share of the thickness, to the sums of Kind's record. The unnamed argument is the
-  // transmittance; kDistance: there is a sum for the centre's distance.
+  // Adds to the sums of Kind's record, from the gradients of optical thickness and of the z-depths of entry and exit (0
+  // in lanes without a hit), and the density's additional gradient besides its share of the thickness. The unnamed
+  // argument is the transmittance. kDistance: there is a sum for the centre's distance.
   template <class Kind, bool kDistance>
   static void add_gradient(const typename Kind::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in,
                            V d_out, V d_density, V px, V py, V* sums) {
     const V zero = V::set(0), d_chord = d_tau * V::set(r.density);
     sums[Sum::density] = fma(d_tau, m.chord, sums[Sum::density] + d_density);
-    const M faced = hit & is_face(m.in_face);  // a ray that entered through the near plane moves with no face
+    const M faced = hit & is_face(m.in_face);  // no face moves the entry through the near plane
     V g_in, g_out;
     if constexpr (kRays == RayModel::kExact) {
       // chord = |v| (t_out - t_in); w = 1/t, so dL/dw = -t^2 dL/dt.

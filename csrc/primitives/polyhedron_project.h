@@ -1,24 +1,24 @@
-// What the polyhedra share when they are projected: face planes over the pixels for both ray models, screen boxes, the
-// screen filter; each with its adjoint beside it.
+// Common parts of projecting polyhedra: face planes over the pixels for both ray models, screen boxes, the screen
+// filter; each with its backward pass next to it.
 //
-// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see polyhedron.h) is (p - kappa) / h
-// with p affine in the pixel and both p and h linear in n:
+// A face is the plane n . (x - c) = 1 in camera space. Its w over the pixels (see polyhedron.h) is (p - kappa) / h with
+// p affine in the pixel and both p and h linear in n:
 //   exact rays   p = n . (v - w0 c), kappa = w0, h = 1 + m, m = n . c           (w = inverse depth - w0)
 //   affine rays  p = n'_u (u - u_c) + n'_v (v - v_c), kappa = 1, h = m, m = n . j / |j|,   n' = J^-T n   (w = |c| -
 //   distance)
 // J is the Jacobian of (x/z, y/z, |x|) at j, the ray space of EWA splatting (Zwicker et al. 2002, section 4). j is the
-// centre c, or at its depth the nearest to it in a margin around the image, as for Gaussians: beyond, J grows without
-// bound and small things cover the image.
+// centre c or, as for Gaussians, the nearest position at its depth within a margin around the image: beyond, J grows
+// without bound and small primitives would cover the image.
 #pragma once
 
 #include "primitives/primitive_pose.h"
 
 namespace linprim::LINPRIM_ISA {
 
-// A face seen edge-on divides by h = 0; |h| is kept above this part of the largest term in it.
+// A face seen edge-on would divide by h = 0; |h| is kept above this share of its largest term.
 constexpr double kEdgeOn = 1e-6;
 
-// h moved away from 0, its sign kept; `size` is that of its largest term.
+// Moves h away from 0, keeping its sign; `size` is the size of its largest term.
 inline D off_edge(D h, D size) {
   const D floor = kEdgeOn * size;
   return vabs(h) < floor ? (h < 0.0 ? -floor : floor) : h;
@@ -37,7 +37,7 @@ struct RayFrame {
   B free[2];                            // affine: j follows x, y of the centre
   B crosses_near;                       // exact: w0 = 0 and the reference is the principal point
 
-  // `reach` is how far the primitive extends from its centre along z, both ways.
+  // `reach` is the extent of the primitive from its centre along z, in both directions.
   RayFrame(const View& v, const D center[3], D reach) : view(v), c(center) {
     crosses_near = kExact ? (B)(c[2] - reach < view.near) : B{};
     const D safe_z = kExact ? (crosses_near ? splat(1.0) : c[2]) : (c[2] > view.near ? c[2] : splat(1.0));
@@ -67,7 +67,7 @@ struct RayFrame {
     free[0] = (B)(u == held_u), free[1] = (B)(v == held_v);
     held[0] = free[0] ? c[0] : held_u * z, held[1] = free[1] ? c[1] : held_v * z, held[2] = z;
   }
-  // p at the reference pixel, its steps per pixel, and m.
+  // Computes p at the reference pixel, its steps per pixel, and m.
   void form(const D n[3], D& p, D& px, D& py, D& m) const {
     if constexpr (kExact) {
       p = dot(n, base), px = n[0] * (1.0 / view.fx), py = n[1] * (1.0 / view.fy), m = dot(n, c);
@@ -100,12 +100,12 @@ struct RayFrame {
       add_centre(g_uc, g_vc, c_grad);
     }
   }
-  // Adds the gradient of (x/z, y/z) at the centre.
+  // Adds the gradient through (x/z, y/z) of the centre.
   void add_centre(D g_u, D g_v, D c_grad[3]) const {
     c_grad[0] += g_u * inverse_z, c_grad[1] += g_v * inverse_z;
     c_grad[2] -= (g_u * c[0] + g_v * c[1]) * inverse_z * inverse_z;
   }
-  // Pixel index where the ray model puts c + arm, and the adjoint.
+  // Projects c + arm to pixel indices with the ray model; the backward pass follows.
   void project(const D arm[3], D& x, D& y) const {
     if constexpr (kExact) {
       const D inverse = 1.0 / (crosses_near ? splat(1.0) : c[2] + arm[2]);
@@ -133,7 +133,7 @@ struct RayFrame {
   }
 };
 
-// Screen box of the vertices c + arm[i], pixel indices.
+// Screen box of the vertices c + arm[i], in pixel indices.
 struct Box {
   D low_x, high_x, low_y, high_y;
 };
@@ -149,8 +149,8 @@ inline Box box_of(const RayFrame<kRays>& rays, const D (*arm)[3], int vertices) 
   return box;
 }
 
-// For lanes that cross the near plane: the box of what lies beyond it, from the vertices there and where edges pass
-// through. Every two vertices are joined by an edge but, with kOpposite, 2 k and 2 k + 1.
+// For lanes that cross the near plane: the screen box of the part beyond it, from the vertices there and the points
+// where edges cross the plane. Every two vertices are connected by an edge except, with kOpposite, 2 k and 2 k + 1.
 template <bool kOpposite>
 inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], int vertices, B crosses, int lanes,
                        Box& box) {
@@ -173,13 +173,14 @@ inline void clip_boxes(const View& view, const D center[3], const D (*arm)[3], i
         add(at[i][0] + part * (at[j][0] - at[i][0]), at[i][1] + part * (at[j][1] - at[i][1]), view.near);
       }
     }
-    // Planes of what crosses the near plane count from inverse depth 0: a pixel for their rounding.
+    // Face planes of primitives that cross the near plane are relative to inverse depth 0: one pixel covers their
+    // rounding.
     box.low_x[l] = low_x - 1, box.high_x[l] = high_x + 1, box.low_y[l] = low_y - 1, box.high_y[l] = high_y + 1;
   }
 }
 
-// Screen filter: a pixel's ray meets the primitive where the ray of (pixel - projected centre) * scale would, so its
-// box grows by half the filter on every side; density is multiplied by scale_x scale_y, which keeps the optical
+// Screen filter: a pixel's ray intersects the primitive where the ray of (pixel - projected centre) * scale would, so
+// its box grows by half the filter on every side. Density is multiplied by scale_x scale_y, which preserves the optical
 // thickness summed over the screen.
 template <RayModel kRays>
 struct ScreenFilter {
@@ -203,15 +204,14 @@ struct ScreenFilter {
     box.low_x = x + (box.low_x - x) / scale_x, box.high_x = x + (box.high_x - x) / scale_x;
     box.low_y = y + (box.low_y - y) / scale_y, box.high_y = y + (box.high_y - y) / scale_y;
   }
-  // Turns the gradients of a filtered form into those of the form; gathers its part of the gradients to scales and
-  // centre.
+  // Converts the gradients of a filtered form to those of the form; accumulates the gradients of scales and centre.
   D g_scale_x{}, g_scale_y{}, g_center_x{}, g_center_y{};
   void apply_grad(D px, D py, D g, D& gx, D& gy) {
     g_scale_x += px * (gx - g * center_x), g_scale_y += py * (gy - g * center_y);
     g_center_x += px * (1.0 - scale_x) * g, g_center_y += py * (1.0 - scale_y) * g;
     gx = g * (1.0 - scale_x) * center_x + gx * scale_x, gy = g * (1.0 - scale_y) * center_y + gy * scale_y;
   }
-  // Adds what was gathered, and the density's part, to the gradients of vertices and centre.
+  // Adds the accumulated gradients, and the density's part, to the gradients of vertices and centre.
   void finish(const RayFrame<kRays>& rays, const Box& box, const D (*arm)[3], int vertices, D density, D density_grad,
               D (*arm_grad)[3], D c_grad[3]) {
     g_scale_x += density_grad * density * scale_y, g_scale_y += density_grad * density * scale_x;
@@ -236,15 +236,15 @@ struct ScreenFilter {
   }
 };
 
-// Longest ray (u, v, 1) of the image.
+// Returns the length of the longest ray (u, v, 1) of the image.
 inline double longest_ray(const View& view) {
   const double u = std::max(std::fabs(0.5 - view.cx), std::fabs(view.width - 0.5 - view.cx)) / view.fx;
   const double v = std::max(std::fabs(0.5 - view.cy), std::fabs(view.height - 0.5 - view.cy)) / view.fy;
   return std::sqrt(1 + u * u + v * v);
 }
 
-// The order's key: depth of the centre, or a depth that no ray meets the primitive before; `nearest` is the smallest z
-// (exact rays) or distance (affine) of its vertices.
+// Sort key of the order: the depth of the centre, or a lower bound of the depth at which any ray meets the primitive.
+// `nearest` is the smallest z (exact rays) or distance (affine) of its vertices.
 template <RayModel kRays>
 inline D order_key(const RayFrame<kRays>& rays, D nearest, double longest) {
   if (rays.view.order == Order::kCenter) return rays.c[2];

@@ -1,5 +1,5 @@
-// What every primitive kind does once per primitive and view: pose in camera space, colour, screen bounds; and the
-// adjoints of that.
+// Computations that all primitive kinds need once per primitive and view: pose in camera space, colour, screen bounds;
+// and their backward passes.
 #pragma once
 
 #include <algorithm>
@@ -10,21 +10,21 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// Densities above this, opaque over any length that floats resolve, are taken as this: products with it stay finite.
+// Upper limit of densities: opaque over any length that floats resolve, and products with it stay finite.
 constexpr double kLargestDensity = 1e20;
-// Extents outside of these are taken as these: their planes, and squares of depths, stay finite in single precision.
+// Limits of extents: within them, face planes and squares of depths stay finite in single precision.
 constexpr double kSmallestExtent = 1e-15, kLargestExtent = 1e12;
-// Slack, in pixels, of screen bounds and silhouette lines: covers the float rounding of the planes the tile kernels
+// Slack of screen bounds and silhouette lines in pixels: covers the float rounding of the planes that the tile kernels
 // evaluate.
 constexpr double kPixelSlack = 1e-3;
-// Slack, relative, of the depth that a primitive is promised not to reach before.
+// Relative slack of the lower bound of a primitive's depth.
 constexpr double kDepthSlack = 1e-5;
 
-// The affine approximation at a centre far outside of the image runs away with x/z and y/z: these are held within the
-// image and this part of its size around it, which is 1.3 times half the field of view to either side if the principal
+// The affine approximation diverges for centres far outside of the image. Therefore x/z and y/z are clamped to the
+// image and this share of its size around it, which is 1.3 times half the field of view to either side if the principal
 // point is in the middle.
 constexpr double kViewMargin = 0.15;
-// An image that lies beyond, with its principal point far outside, is held at that.
+// Upper limit of these slopes, for images whose principal point lies far outside.
 constexpr double kLargestSlope = 1e4;
 inline D held_in_view(D slope, int pixels, double principal, double focal) {
   const auto limit = [&](double pixel) {
@@ -66,7 +66,7 @@ inline void set_pose(const View& view, const Primitives<Real>& p, const int64_t*
     for (int i = 0; i < 3; ++i) f.axis[k][i] = w[4 * i] * r[0][k] + w[4 * i + 1] * r[1][k] + w[4 * i + 2] * r[2][k];
 }
 
-// From the gradients to the camera-space axes to those of the raw quaternion: through R = W^T [axes], the unit
+// Converts gradients of the camera-space axes to gradients of the raw quaternion: through R = W^T [axes], the unit
 // quaternion and its normalisation.
 inline void rotation_grad(const View& view, const Pose& f, const D axis_grad[3][3], D q_grad[4]) {
   const double* w = view.world_to_camera;
@@ -95,7 +95,7 @@ struct Eye {
   }
 };
 
-// Unit vector from the camera to the centre (0 where they coincide) and the inverse of their distance.
+// Computes the unit vector from the camera to the centre (0 where they coincide) and the inverse of their distance.
 inline void view_direction(const Eye& eye, const Pose& f, D direction[3], D& inverse) {
   D length2{};
   for (int i = 0; i < 3; ++i) {
@@ -106,7 +106,7 @@ inline void view_direction(const Eye& eye, const Pose& f, D direction[3], D& inv
   for (int i = 0; i < 3; ++i) direction[i] *= inverse;
 }
 
-// A colour with one value to spare, so that it is one load.
+// A colour padded to four values, so that it is loaded at once.
 template <class Real>
 struct Rgb {
   typedef Real Four __attribute__((vector_size(4 * sizeof(Real))));
@@ -127,8 +127,8 @@ struct Narrow {
   }
 };
 
-// rgb = max(0, 0.5 + sum_i basis_i(direction) sh_i) of the visible lanes, to `color` and, `stride` apart, to `record`.
-// A colour that is not finite is handed on as it is, for the caller to find.
+// Writes rgb = max(0, 0.5 + sum_i basis_i(direction) sh_i) of the visible lanes to `color` and, `stride` apart, to
+// `record`. A colour that is not finite is passed on unchanged, so that the caller can detect it.
 template <class Real>
 inline void evaluate_color(const Eye& eye, const Pose& f, const Primitives<Real>& p, int64_t first, int lanes,
                            B visible, Real* color, Real* record, int64_t stride) {
@@ -154,8 +154,8 @@ inline void evaluate_color(const Eye& eye, const Pose& f, const Primitives<Real>
   }
 }
 
-// The adjoint, for one lane: from the gradient to the colour to the coefficients (written) and to the centre in the
-// world (added).
+// Backward pass of the colour for one lane: from the gradient to the colour to those of the coefficients (written) and
+// of the centre in the world (added).
 template <class Real>
 struct ColorAdjoint {
   D direction[3], inverse;
@@ -195,8 +195,8 @@ struct ColorAdjoint {
   }
 };
 
-// The inclusive box of pixels around [low, high], coordinates in pixel indices (pixel j has its centre at j); lanes
-// without a pixel of the image leave `visible`.
+// Sets the inclusive box of pixels around [low, high], in pixel indices (pixel j has its centre at j). Lanes without a
+// pixel of the image are removed from `visible`.
 inline void set_boxes(const View& view, D low_x, D high_x, D low_y, D high_y, int lanes, B& visible, Footprint* print) {
   const B x0 = ceil_of(clamp(low_x - kPixelSlack, 0.0, 1e9)),
           x1 = floor_of(clamp(high_x + kPixelSlack, -1.0, view.width - 1.0));
@@ -209,7 +209,8 @@ inline void set_boxes(const View& view, D low_x, D high_x, D low_y, D high_y, in
   }
 }
 
-// Half-planes a + b x + c y > 0 with their slack, `count` of 6; the others hold everything. x and y from the reference.
+// Sets `count` of 6 half-planes a + b x + c y > 0 with their slack; the others contain everything. x and y are relative
+// to the reference pixel.
 inline void set_lines(const D* a, const D* b, const D* c, int count, int lanes, Footprint* print) {
   constexpr int kRow = sizeof(Footprint) / sizeof(float);
   D line[18];
@@ -232,8 +233,8 @@ inline void zero_row(const PrimitiveGradients<Real>& out, int64_t row, int exten
   std::memset(out.sh + row * sh_count * 3, 0, sizeof(Real) * sh_count * 3);
 }
 
-// Adds up the slots of each lane's primitive; rows without a slot are written as zero. Returns whether any lane has
-// one.
+// Sums the gradient slots of each lane's primitive; rows without a slot are written as zero. Returns whether any lane
+// has one.
 template <class Real>
 inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, double (*sums)[kGeometrySums]) {
   bool found = false;
@@ -249,14 +250,14 @@ inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, do
   return found;
 }
 
-// A gradient that is too large for Real is handed on as the largest.
+// Clamps a gradient to the range of Real.
 template <class Real>
 inline Real saturated(double x) {
   constexpr double kMost = double(std::numeric_limits<Real>::max());
   return Real(std::clamp(x, -kMost, kMost));
 }
 
-// What the chains write at the end: gradients in camera space of the visible lanes, to rows.
+// Gradients in camera space, which the chain functions convert and write to the rows of the visible lanes.
 struct RowGradients {
   D center[3];   // camera space
   D axis[3][3];  // of the unit axes, camera space

@@ -1,7 +1,7 @@
-// Real spherical harmonics up to degree 3 and their derivatives, generic over the number type.
+// Real spherical harmonics up to degree 3 and their derivatives, for any number type.
 //
-// Signs and order are those of splatting's files: degree 1 is -y, z, -x. The constants are the orthonormal ones,
-// K_l^m = sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!) times sqrt(2) for m != 0, multiplied out in Cartesian form.
+// Signs and order are those of 3D Gaussian splatting's files: degree 1 is -y, z, -x. The constants are the orthonormal
+// ones, K_l^m = sqrt((2l+1)/(4 pi) (l-|m|)!/(l+|m|)!) times sqrt(2) for m != 0, expanded in Cartesian form.
 #pragma once
 
 namespace linprim::LINPRIM_ISA {

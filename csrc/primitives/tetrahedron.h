@@ -1,9 +1,9 @@
-// A tetrahedron: how a tile kernel meets it (entry and exit of the rays of 16, 8, 4 or 1 pixels), how it is projected
-// to a record for that, and the adjoints of both.
+// Tetrahedra: how a tile kernel intersects them (entry and exit of the rays of 16, 8, 4 or 1 pixels), how a tetrahedron
+// is projected to a record for that, and the backward passes of both.
 //
-// Vertices are c + d_j e_j with e_j the four directions of a regular tetrahedron, turned. As sum e_j = 0 and e_i . e_j
-// = -1/3, the face that omits vertex j is n_j . (x - c) = 1 with n_j = 3/4 sum_(i != j) u_i (e_i - e_j), u = 1/d, which
-// does not know d_j.
+// Vertices are c + d_j e_j with e_j the four rotated directions of a regular tetrahedron. As sum e_j = 0 and e_i . e_j
+// = -1/3, the face opposite to vertex j is n_j . (x - c) = 1 with n_j = 3/4 sum_(i != j) u_i (e_i - e_j), u = 1/d,
+// which does not depend on d_j.
 #pragma once
 
 #include "primitives/polyhedron.h"
@@ -11,7 +11,7 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// As the tile kernels read it.
+// A projected tetrahedron as the tile kernels read it.
 template <class Real>
 struct alignas(16) TetrahedronRecord {
   Real a[4], b[4], c[4];  // planes of the faces, see polyhedron.h
@@ -30,8 +30,8 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
   using I = typename Base::I;
   using Meeting = typename Base::Meeting;
 
-  // Planes where the rays enter and leave; x and y are counted in pixels from the record's reference. kTrack: also
-  // which faces.
+  // Computes the planes where the rays enter and leave; x and y are in pixels relative to the record's reference.
+  // kTrack: also which faces.
   template <bool kTrack>
   static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
     constexpr bool kExact = kRays == RayModel::kExact;
@@ -49,8 +49,8 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
     return m.out < m.in;
   }
 
-  // Adds gradients to the planes of entry and exit (0 in lanes without a hit): with g the gradient to face f's plane,
-  // the sums of g, g x and g y at f, 4 + f and 8 + f; px and py are positions from the pair's origin.
+  // Accumulates the gradients of the entry and exit planes (0 in lanes without a hit): with g the gradient to face f's
+  // plane, the sums of g, g x and g y at f, 4 + f and 8 + f. px and py are positions relative to the pair's origin.
   static void add_planes(const Record&, const Meeting& m, M, V g_in, V g_out, V px, V py, V* sums) {
     const V zero = V::set(0);
     for (int f = 0; f < 4; ++f) {
@@ -250,7 +250,7 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
         for (int i = 0; i < 3; ++i) out.center[i] += sum(Sum::distance) * f.pose.center[i] * rays.inverse_length;
     D e_grad[4][3];
     for (int i = 0; i < 4; ++i) {
-      D along{}, others[3] = {}, shares{};  // over the faces that know vertex i; shares: over the other vertices
+      D along{}, others[3] = {}, shares{};  // over the faces that contain vertex i; shares: over the other vertices
       for (int j = 0; j < 4; ++j) {
         if (j == i) continue;
         shares += f.u[j];
@@ -274,8 +274,8 @@ void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
       for (int i = 0; i < 3; ++i)
         out.axis[k][i] = kDirection[0][k] * e_grad[0][i] + kDirection[1][k] * e_grad[1][i] +
                          kDirection[2][k] * e_grad[2][i] + kDirection[3][k] * e_grad[3][i];
-    // Movement on the screen, whole and tile by tile, as that of the centre at its depth, or at the middle of the
-    // depths beyond the near plane.
+    // Screen-space gradients, total and per tile: as if the centre moved at its depth, or at the middle of the depths
+    // beyond the near plane.
     const D z = rays.crosses_near ? (view.near + f.pose.center[2] + f.high_z) * 0.5 : f.pose.center[2];
     out.screen_x = out.center[0] * z * (1.0 / view.fx), out.screen_y = out.center[1] * z * (1.0 / view.fy);
     double pull[kLanes] = {};

@@ -1,4 +1,4 @@
-// Which 4x4 blocks of which tiles a primitive's silhouette touches. Included by kernels.cpp only.
+// Binning: which 4x4 pixel blocks of which tiles a primitive's silhouette touches. Included by kernels.cpp only.
 #pragma once
 
 #include <algorithm>
@@ -22,7 +22,7 @@ int64_t bin(const BinParams& P, int64_t begin, int64_t end, LoosePair* out, int6
   int64_t count = 0, i = begin;
   for (; i < end; ++i) {
     const Footprint& f = footprints[visible[i]];
-    // The box in blocks, and in tiles; what is visible has no negative corner.
+    // The box in blocks and in tiles; visible primitives have no negative corner.
     const int bx0 = int(uint32_t(f.x0) / kBlock), bx1 = int(uint32_t(f.x1) / kBlock);
     const int by0 = int(uint32_t(f.y0) / kBlock), by1 = int(uint32_t(f.y1) / kBlock);
     const int tx0 = bx0 / kSide, tx1 = bx1 / kSide, ty0 = by0 / kSide, ty1 = by1 / kSide;

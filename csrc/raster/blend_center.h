@@ -1,18 +1,19 @@
-// Blending primitives one after another in the order of their tile's list, and the adjoint of that.
+// Blending primitives one after another in the order of their tile's list, and its backward pass.
 //
-// Forward, a tile goes block by block, so that a block's pixels stay in registers; backward, primitive by primitive, so
-// that a primitive's gradient sums do. Both first intersect a few entries and then blend them: the two halves of an
-// entry are long chains of dependent instructions, and apart from each other the processor can overlap several of each.
+// The forward pass processes a tile block by block, so that a block's pixels stay in registers; the backward pass
+// processes it primitive by primitive, so that a primitive's gradient sums stay in registers. Both intersect several
+// entries before they blend them: each half of an entry is a long chain of dependent instructions, and in separate
+// loops the processor can overlap several of each.
 #pragma once
 
 #include "raster/tile.h"
 
 namespace linprim::LINPRIM_ISA {
 
-constexpr int kChunk = 32;  // pairs of a list that are looked at together, one bit each
+constexpr int kChunk = 32;  // pairs of a list that are processed together, one bit each
 constexpr int kGroup = 8;   // entries that are intersected before they are blended
 
-// The per-pixel state of the geometric outputs while a tile is blended forward.
+// Per-pixel state of the geometry outputs in the forward pass of a tile.
 enum GeometryState {
   kFirst,
   kReference,
@@ -26,7 +27,7 @@ enum GeometryState {
   kGeometryStates
 };
 
-// Adds one primitive to the geometric outputs of a part of a block.
+// Adds one primitive to the geometry outputs of a part of a block.
 template <class Kind>
 inline void blend_geometry(const typename Kind::Record& record, const typename Kind::Real (*normals)[3],
                            Vec<typename Kind::Real, Kind::kWidth> v_length, Mask<typename Kind::Real, Kind::kWidth> hit,
@@ -76,8 +77,8 @@ inline void blend_geometry(const typename Kind::Record& record, const typename K
   }
 }
 
-// Writes a tile's finished pixels to the image planes. Colours come without the background, `through` is what is left
-// of the light.
+// Writes a tile's finished pixels to the image planes. Colours come without the background; `through` is the remaining
+// transmittance.
 template <class Real, int W, bool kGeometry>
 inline void store_pixels(const RasterParams<Real>& P, int tile_x, int tile_y, Real* red, Real* green, Real* blue,
                          Real* through, Real (*geo)[kTilePixels]) {
@@ -208,14 +209,15 @@ Counts forward_center(const RasterParams<typename Kind::Real>& P, int tile, void
   return {visited, hit_lanes};
 }
 
-// The per-pixel state of a backward pass: what is still in front of us, and the incoming gradients.
+// Per-pixel state of the backward pass: the contribution still ahead along the ray, and the incoming gradients.
 template <class Real, int W, bool kGeometry>
 struct Incoming {
-  // remaining = sum over what is still in front of us (background included) of its weight times (its value . gradient).
+  // remaining = sum, over everything still ahead along the ray (background included), of its weight times (its value .
+  // gradient).
   alignas(64) Real length[kTilePixels], through[kTilePixels], remaining[kTilePixels], red[kTilePixels],
       green[kTilePixels], blue[kTilePixels], one[kTilePixels];
   // Gradients to moment 1, moment 2, first depth, median depth, normal, median normal; then reference depth, 1/(density
-  // |v|), seen.
+  // |v|), and whether a primitive was hit.
   enum {
     kMoment1,
     kMoment2,
@@ -230,7 +232,7 @@ struct Incoming {
   };
   alignas(64) Real geo[kGeometry ? kStates : 1][kTilePixels];
 
-  // Reads the planes of one tile; writes the tile's share of the background's gradient.
+  // Loads the planes of one tile; writes the tile's share of the background's gradient.
   void load(const RasterParams<Real>& P, int tile, int tile_x, int tile_y) {
     using T = Tile<Real, W>;
     using V = Vec<Real, W>;
@@ -276,7 +278,8 @@ struct Incoming {
   }
 };
 
-// The adjoint of blending one primitive into a part of a block: adds to its sums, and takes it from what is in front.
+// Backward pass of blending one primitive into a part of a block: adds to the primitive's sums and removes it from the
+// remaining contribution.
 template <class Kind, bool kGeometry>
 inline void blend_backward(const typename Kind::Record& record, const typename Kind::Real (*normals)[3],
                            const View& view, Incoming<typename Kind::Real, Kind::kWidth, kGeometry>& state,
@@ -351,15 +354,15 @@ inline void blend_backward(const typename Kind::Record& record, const typename K
   select(hit, after, t).store(state.through + at);
 }
 
-// Where, in a tile, the positions in a pair's sums count from: the reference pixel, or the tile's pixel nearest to it.
-// Sums of what lies near the reference then cancel nowhere.
+// Origin, within a tile, of the positions in a pair's sums: the reference pixel, or the tile's pixel nearest to it.
+// This avoids cancellation in sums near the reference.
 template <class Real>
 inline Real origin_in_tile(Real reference, int tile) {
   return std::clamp(reference - Real(tile), Real(0), Real(kTile - 1));
 }
 
-// The same object, but the compiler does not know: keeps it from copying a record's fields to the stack before a loop
-// over few entries.
+// Returns the same object but hides its identity from the compiler, which would otherwise copy a record's fields to the
+// stack before a loop over few entries.
 template <class T>
 inline const T& opaque(const T& object) {
   const T* p = &object;
@@ -375,7 +378,7 @@ void backward_center(const RasterParams<typename Kind::Real>& P, int tile, void*
   using V = typename T::V;
   using M = typename T::M;
   constexpr int kSums = kGeometry ? Kind::kGeometrySums : Kind::kColorSums;
-  constexpr int kReady = 4;  // entries that are intersected before they are worked on
+  constexpr int kReady = 4;  // entries that are intersected before they are blended
   constexpr int kAhead = 6;  // pairs whose records are fetched before their turn
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;

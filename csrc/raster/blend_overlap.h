@@ -1,25 +1,26 @@
-// Primitives that absorb where they are, overlaps included: the emission and absorption integral itself, segment by
-// segment, and its adjoint.
+// Exact overlap: the emission-absorption integral, where the densities of overlapping primitives add up, segment by
+// segment, and its backward pass.
 //
-// Between two events (entries, exits) of a ray the density sigma = sum_i sigma_i of the primitives it is in is
-// constant, and so is their emission sum_i sigma_i c_i. With T0 the transmittance at the start of a segment of
+// Between two events (entries, exits) of a ray, the density sigma = sum_i sigma_i of the primitives that contain it is
+// constant, and so is their emission sum_i sigma_i c_i. With T0 the transmittance at the start of a segment of optical
 // thickness tau and length L,
 //   X_k = integral of x^k T over the segment = T0 L^(k+1) phi_k(tau),   phi_k(tau) = integral of x^k exp(-tau x) over
 //   [0, 1],
-// gives every output: primitive i's weight grows by sigma_i X_0, colour by c_i of that, the depths by X_1 and X_2.
-// Adjoint: with e_i the gradient to weight of i, h(t) that of the depths, and R(t) what is still in front of a ray at
-// depth t,
+// gives every output: primitive i's weight increases by sigma_i X_0, the colour by c_i times that, the depths by X_1
+// and X_2. Backward pass: with e_i the gradient to the weight of i, h(t) that of the depths, and R(t) the contribution
+// still ahead of a ray at depth t,
 //   dL/dsigma_i = integral over i's interval of T (e_i + h) - R,   dL/dt_out_i = sigma_i (T (e_i + h) - R) at t_out_i,
-// and minus that at t_in_i. Model: Mai et al. 2024 (EVER, arXiv 2410.01804), here for any convex polyhedra.
+// and the negative of that at t_in_i. Model: Mai et al. 2024 (EVER, arXiv 2410.01804), here for any convex polyhedra.
 #pragma once
 
 #include "raster/blend_sorted.h"
 
 namespace linprim::LINPRIM_ISA {
 
-// phi_0 .. phi_(kCount-1) of tau >= 0, with alpha = 1 - exp(-tau) and through = exp(-tau). Above the limit by the
-// recursion phi_k = (k phi_(k-1) - exp(-tau)) / tau, which loses at most k! / tau^k of its digits there; below it by
-// the series of the last, sum_j (-tau)^j / (j! (kCount + j)), and the same recursion downwards, which loses none.
+// Computes phi_0 .. phi_(kCount-1) of tau >= 0, with alpha = 1 - exp(-tau) and through = exp(-tau). Above a limit of
+// 0.7 by the recursion phi_k = (k phi_(k-1) - exp(-tau)) / tau, whose relative error grows at most by k! / tau^k there;
+// below it by the series of the last, sum_j (-tau)^j / (j! (kCount + j)), and the same recursion downwards, which loses
+// no precision.
 template <int kCount, class Real, int W>
 inline void slice_moments(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> through, Vec<Real, W>* phi) {
   using V = Vec<Real, W>;
@@ -49,16 +50,16 @@ struct OverlapCandidate {
   const typename Kind::Record* record;
   uint32_t entry, pixels;
   typename Kind::Meeting meeting;
-  V t_in, t_out;                               // both before every event where the ray misses
-  V rate;                                      // density per z-depth
+  V t_in, t_out;                               // both before every event if the ray misses
+  V rate;                                      // density per unit of z-depth
   V weight;                                    // integral of T density over its interval so far
-  V value, d_density, d_in, d_out;             // backward: gradient to weight, gradients gathered so far
+  V value, d_density, d_in, d_out;             // backward: gradient to weight, gradients accumulated so far
   V d_median[kBackward && kGeometry ? 4 : 1];  // to the normals of slots 0-3 at the median: their common factor
 };
 
-// Walks the rays of a part from event to event while open() says that a ray is: begin(candidate, rays that meet it),
-// then, from each event to the next, segment(now, next, rays that have a next event), and finish(candidate) when no ray
-// meets it any more.
+// Advances the rays of a part from event to event while open() has rays that have not ended. Calls begin(candidate,
+// rays that meet it); then, from each event to the next, segment(now, next, rays that have a next event); and
+// finish(candidate) when no ray meets it any more.
 template <class Kind, bool kTrack, class Candidate, class Begin, class Open, class Segment, class Finish>
 inline void sweep_overlaps(Window<Kind, Candidate>& window, const View& view,
                            const Part<typename Kind::Real, Kind::kWidth>& part,
@@ -84,7 +85,7 @@ inline void sweep_overlaps(Window<Kind, Candidate>& window, const View& view,
       Kind::thickness(*c.record, v_length, hit, c.meeting);
       V t_in, t_out;
       Kind::depths(*c.record, v_length, c.meeting, t_in, t_out);
-      // An interval that rounds to nothing is not met; a ray does not go back.
+      // An interval that rounds to zero length is not a hit; depths never decrease along a ray.
       const M met = hit & (t_in < t_out) & (now < t_out);
       if (!met.bits()) {
         window.drop_last();
@@ -165,7 +166,7 @@ Counts forward_overlap(const RasterParams<typename Kind::Real>& P, int tile, voi
                     facing[k] = fma(share, V::set(P.normals[P.lists.primitive[c.entry]][f][k]), facing[k]);
                 }
             }
-            // Before the first event there is nothing: a length of 0 keeps what is not a number away.
+            // Before the first event nothing is absorbed: a length of 0 avoids NaN.
             const V length_here = select(steps & (V::set(-kNever<Real>) < now), next - now, zero),
                     tau = sigma * length_here;
             V alpha, e_tau, phi[1];
@@ -219,7 +220,7 @@ Counts forward_overlap(const RasterParams<typename Kind::Real>& P, int tile, voi
   return {visited, hit_lanes};
 }
 
-// Under affine rays depths follow the distance of the centre, which has its sum among the geometric ones.
+// With affine rays, depths depend on the distance of the centre, whose sum is among the geometry sums.
 template <class Kind, bool kGeometry>
 constexpr int kOverlapSums = kGeometry || Kind::kRayModel == RayModel::kAffine ? Kind::kGeometrySums : Kind::kColorSums;
 
@@ -255,11 +256,11 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
       const V one = V::load(state.one + at);
       const V g1 = kGeometry ? incoming(S::kMoment1) : zero, g2 = kGeometry ? incoming(S::kMoment2) : zero;
       const V origin = kGeometry ? incoming(S::kReference) : zero;
-      // The median depth moves with all the thickness before it: as if that much were always in front, until the
-      // crossing.
+      // The median depth depends on all the optical thickness before it: as if this much were always still ahead, up to
+      // the crossing.
       const V pull = kGeometry ? zero - incoming(S::kMedian) * incoming(S::kSlowness) : zero;
       V t = V::load(state.through + at), rest = V::load(state.remaining + at);
-      V crossed = zero, started = zero;  // 1 once the median, the first entry is behind
+      V crossed = zero, started = zero;  // 1 after the median, and after the first entry
       // h(t) = g1 (t - origin) + g2 (t - origin)^2.
       auto along = [&](V depth) { return (depth - origin) * fma(depth - origin, g2, g1); };
       window.start(block);
@@ -292,19 +293,20 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
             exp_neg(tau, alpha, e_tau);
             slice_moments<kMoments>(tau, alpha, e_tau, phi);
             V power = t * length_here;
-            // Powers of a length of 1e10 leave single precision; held at its end, 0 times them stays 0.
+            // Powers of a length of 1e10 overflow single precision; with an upper limit, 0 times them stays 0.
             const V most = V::set(std::numeric_limits<Real>::max() / 1024);
             for (int k = 0; k < kMoments; ++k) X[k] = power * phi[k], power = min(power * length_here, most);
             const V after = t * e_tau;
             V bulk = zero,
-              front = emission * X[1];  // integral of T h; integral of what the segment itself still has in front
+              front = emission * X[1];  // integral of T h; integral of the segment's own contribution still ahead
             V before_median = length_here;
             M crossing = M::all(false);
             if constexpr (kGeometry) {
               const V from = select(V::set(-kNever<Real>) < now, now - origin, zero), p0 = from * fma(from, g2, g1),
                       p1 = fma(from + from, g2, g1);
               bulk = fma(p0, X[0], fma(p1, X[1], g2 * X[2]));
-              // Density first: a factor of depth times the cube of a length of 1e12 would leave single precision.
+              // Multiply by the density first: a factor of depth times the cube of a length of 1e12 would overflow
+              // single precision.
               front = fma(p0, sigma * X[1], fma(p1, sigma * X[2], fma(g2, sigma * X[3], front)));
               crossing = steps & (v_level < t) & (v_level >= after);
               const V inside = log(select(crossing, t * V::set(Real(1 / view.level)), V::set(1))) *
@@ -313,7 +315,7 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
                   select(crossed < V::set(Real(0.5)), select(crossing, min(inside, length_here), length_here), zero);
             }
             const V rest_after = rest - fma(sigma, bulk, emission * X[0]);
-            // What is in front, integrated over the segment, for every unit of density in it.
+            // The contribution still ahead, integrated over the segment, per unit of density in it.
             V shade = fma(length_here, rest_after, front);
             if constexpr (kGeometry) shade = shade - pull * before_median;
             for (int i = 0; i < window.size(); ++i) {
@@ -351,7 +353,7 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
               }
               crossed = select(crossing, V::set(1), crossed);
             }
-            // Events: what a boundary that moves by a little takes or leaves.
+            // Events: the change of the loss when a boundary moves.
             V edge = zero - rest_after;
             if constexpr (kGeometry) edge = edge + select(crossed < V::set(Real(0.5)), pull, zero);
             const V depth_part = kGeometry ? along(select(steps, next, origin)) : zero;

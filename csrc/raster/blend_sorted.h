@@ -1,10 +1,10 @@
-// Blending by what each ray meets: primitives one after another by their entry depth, or all at once where they
-// overlap; and the adjoints.
+// Blending per ray: primitives one after another by entry depth, or with densities added up where they overlap; and the
+// backward passes.
 //
-// A tile list comes in the order of a depth that no ray meets the primitive before (ProjectParams::key). For the W rays
-// of a part of a block, a window holds the primitives that are being met; the next primitive is taken in as soon as a
-// ray could meet it before its next event. Every ray goes from event to event by itself, but the loops run over the
-// window, the same for all: nothing is gathered or scattered.
+// A tile list is sorted by a lower bound of each primitive's depth (ProjectParams::key). For the W rays of a part of a
+// block, a window holds the primitives that some ray is currently meeting. The next primitive enters the window as soon
+// as a ray could meet it before its next event. Every ray advances from event to event by itself, but the loops run
+// over the window, which is the same for all rays, so no gather or scatter is needed.
 #pragma once
 
 #include <limits>
@@ -13,7 +13,7 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// The primitives of one tile list that a part of a block has in hand. Candidate needs members `record`, `entry`.
+// The primitives of one tile list that a part of a block currently meets. Candidate needs members `record`, `entry`.
 template <class Kind, class Candidate>
 class Window {
  public:
@@ -28,15 +28,15 @@ class Window {
         members_(reinterpret_cast<int32_t*>(candidates_ + capacity + 1)),
         free_(members_ + capacity + 1),
         begin_(P.lists.tile_begin[tile]) {}
-  // Starts a part of a block.
+  // Restarts the list for a part of a block.
   void start(int block) {
     block_ = block, at_ = begin_, count_ = free_count_ = used_ = 0;
     skip();
   }
   bool more() const { return at_ < end_; }
-  // No ray meets what is not yet in the window before this depth.
+  // Lower bound of the depth of primitives that are not in the window yet.
   Real bound() const { return at_ < end_ ? P_.key[P_.lists.primitive[at_]] : std::numeric_limits<Real>::infinity(); }
-  // The next primitive, to be kept or dropped.
+  // Adds the next primitive, which the caller keeps or drops.
   Candidate& take() {
     const int id = free_count_ ? free_[--free_count_] : used_++;
     members_[count_++] = id;
@@ -49,7 +49,7 @@ class Window {
   void drop_last() { free_[free_count_++] = members_[--count_]; }
   int size() const { return count_; }
   Candidate& operator[](int i) { return candidates_[members_[i]]; }
-  // Removes those for which finished(candidate) holds, keeping the order of the others.
+  // Removes the candidates for which finished(candidate) holds, keeping the order of the others.
   template <class Finished>
   void remove(Finished finished) {
     int kept = 0;
@@ -78,7 +78,7 @@ class Window {
 template <class Real>
 constexpr Real kNever = Real(1e30);  // later than every event
 
-// A part of a block: where it is, and the rays through its pixels.
+// A part of a block: its position and the pixels of its rays.
 template <class Real, int W>
 struct Part {
   using V = Vec<Real, W>;
@@ -109,8 +109,8 @@ struct EntryCandidate {
   V sums[kBackward ? (kGeometry ? Kind::kGeometrySums : Kind::kColorSums) : 1];
 };
 
-// Calls blend(candidate, mask) for the rays of a part, each in the order of its entries, while go_on() says that a ray
-// is open; finish(candidate) when a candidate leaves.
+// Calls blend(candidate, mask) for the rays of a part, for each ray in the order of its entry depths, while open() has
+// rays that have not ended; finish(candidate) when a candidate leaves.
 template <class Kind, bool kTrack, class Candidate, class Begin, class Open, class Blend, class Finish>
 inline void sweep_entries(Window<Kind, Candidate>& window, const View& view,
                           const Part<typename Kind::Real, Kind::kWidth>& part,
@@ -120,11 +120,11 @@ inline void sweep_entries(Window<Kind, Candidate>& window, const View& view,
   using V = Vec<Real, Kind::kWidth>;
   using M = Mask<Real, Kind::kWidth>;
   const V never = V::set(kNever<Real>);
-  V last = V::set(-kNever<Real>);  // no ray goes back
+  V last = V::set(-kNever<Real>);  // depths never decrease along a ray
   for (M going = open(); going.bits(); going = open()) {
     V next = never;
     for (int i = 0; i < window.size(); ++i) next = min(next, select(window[i].waiting & going, window[i].t_in, never));
-    // The latest of the next entries, over the rays that have one.
+    // The largest of the next entry depths, over the rays that have one.
     auto latest = [&] { return max_lane(select(going & (next < never), next, V::set(-kNever<Real>))); };
     while (window.more() && (window.bound() <= latest() || !(going & (next < never)).bits())) {
       Candidate& c = window.take();
@@ -217,7 +217,7 @@ Counts forward_entry(const RasterParams<typename Kind::Real>& P, int tile, void*
   return {visited, hit_lanes};
 }
 
-// Adds a finished candidate's sums to its slot.
+// Adds a finished candidate's sums to its gradient slot.
 template <class Kind, int kSums>
 inline void add_to_slot(const typename Kind::Record& record, const Vec<typename Kind::Real, Kind::kWidth>* sums,
                         int tile_x, int tile_y, typename Kind::Real* slot) {

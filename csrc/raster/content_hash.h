@@ -1,4 +1,4 @@
-// A number that tells one view of some primitives from another, by which a backward pass finds its forward pass.
+// A hash that identifies a view of some primitives; a backward pass finds its forward pass by it.
 #pragma once
 
 #include <algorithm>
@@ -32,7 +32,7 @@ inline uint64_t hash_bytes(uint64_t seed, const void* data, size_t bytes) {
   return h ^ (h >> 31);
 }
 
-// Of everything that the forward pass depends on.
+// Returns the hash of all inputs of the forward pass.
 template <class Real>
 uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry, const Real* color) {
   const double numbers[] = {view.fx,
@@ -55,7 +55,7 @@ uint64_t content_hash(const View& view, const Primitives<Real>& p, bool geometry
   std::vector<uint64_t> parts(size_t((p.n + kPerTask - 1) / kPerTask) + 2);
   parts[0] = hash_bytes(1, view.world_to_camera, sizeof view.world_to_camera);
   parts[1] = hash_bytes(2, numbers, sizeof numbers);
-  parallel_for(int64_t(parts.size()) - 2, [&](int64_t task, int) {  // memory sets its time
+  parallel_for(int64_t(parts.size()) - 2, [&](int64_t task, int) {  // memory-bound
     const int64_t begin = task * kPerTask, rows = std::min(p.n - begin, kPerTask);
     uint64_t h = 3;
     auto add = [&](const Real* values, int columns) {

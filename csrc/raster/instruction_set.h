@@ -1,4 +1,4 @@
-// The kernels in force: the choice made by set_instruction_set, the environment's LINPRIM_GEO_ISA, or the best
+// The kernels in use: selected by set_instruction_set, by the environment variable LINPRIM_GEO_ISA, or the best
 // available.
 #pragma once
 

@@ -1,4 +1,4 @@
-// What the instruction-set builds of kernels.cpp offer to the rest of the core: plain parameter structs and tables of
+// Interface of the instruction-set builds of kernels.cpp to the rest of the core: plain parameter structs and tables of
 // functions.
 #pragma once
 
@@ -6,14 +6,14 @@
 
 namespace linprim {
 
-// The primitives of all tiles, tile after tile, each tile's in order: which blocks of the tile a primitive may touch
-// (after a centre-ordered forward pass: does touch) and the slot of its gradient sums. tile_begin has tiles + 1
-// entries.
+// Tile lists: the primitives of all tiles, tile by tile, each tile's in order; the blocks of the tile that each
+// primitive may touch (after a centre-ordered forward pass: does touch); and the slot of its gradient sums. tile_begin
+// has tiles + 1 entries.
 struct TileLists {
   const uint32_t *tile_begin, *primitive, *slot;
   uint32_t* blocks;
 };
-// A (primitive, tile) pair before it is put into its tile's list.
+// A (primitive, tile) pair before it is sorted into its tile's list.
 struct LoosePair {
   uint32_t tile, blocks;
 };
@@ -55,7 +55,8 @@ struct RasterParams {
   Planes<Real> out;
   Real* pair_weight;      // geometry only, per slot: largest weight
   uint32_t* pair_pixels;  // geometry only, per slot: pixels hit
-  // Backward only: `out` then holds what the forward pass wrote, and `grad` the incoming gradients (null where zero).
+  // Backward only: `out` then holds the results of the forward pass, and `grad` the incoming gradients (null where
+  // zero).
   Planes<Real> grad;
   Real* sums;             // per slot
   Real* background_sums;  // per tile, 3
@@ -103,31 +104,31 @@ struct AdamRowsParams {
   const RowTensor* tensors;
   int count;
   const uint8_t* touched;  // per row, or null: the rows with a gradient that is not 0
-  int32_t* steps;          // per row, counted on where touched
+  int32_t* steps;          // per row, incremented where touched
   float beta1, beta2, epsilon;
   const float *inverse, *root;  // 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t) for t < table_size
   int64_t table_size;
   bool table_complete;  // beyond the table both are 1
 };
 
-// What one primitive kind under one ray model is compiled to.
+// Kernels of one primitive kind under one ray model.
 template <class Real>
 struct SolidKernels {
   int64_t record_bytes;
   void (*project)(const ProjectParams<Real>&, int64_t begin, int64_t end);
   void (*chain)(const ChainParams<Real>&, int64_t begin, int64_t end);
-  // Per order and set of outputs (colour; colour and geometry); null where a kind has no such order. `scratch` is the
-  // calling thread's own, scratch_bytes(longest tile list) bytes, 64-byte aligned.
+  // By order and set of outputs (colour; colour and geometry); null if the kind does not support the order. `scratch`
+  // belongs to the calling thread: scratch_bytes(longest tile list) bytes, 64-byte aligned.
   Counts (*forward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   void (*backward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);
   int64_t (*scratch_bytes)(Order, bool geometry, int64_t longest_list);
   int sums_per_slot[kOrders][2];
-  // Depth at the view's transmittance level by exact overlap, into out.depth_median and out.opacity; scratch: 3 *
+  // Depth at the view's transmittance level with exact overlap, into out.depth_median and out.opacity; scratch: 3 *
   // kBlocks values per pair of the tile. Null for Gaussians.
   void (*level_depth)(const RasterParams<Real>&, int tile, Real* scratch);
 };
 
-// What one core can do at this moment, see machine_limits.h.
+// Current speed of one core, see machine_limits.h.
 struct Limits {
   double fma_gflops;                         // multiply-adds count as two
   double exp_ns;                             // per value: alpha and transmittance
@@ -139,16 +140,16 @@ struct Kernels {
   const char* name;
   int width;
   SolidKernels<Real> solids[kKinds][kRayModels];
-  // Appends the pairs of visible[begin..end), each primitive's tile rows downwards, to `out`, which has room for
-  // `capacity`; returns the index of the first primitive that no longer fitted (or `end`), and the number of pairs in
-  // `written`.
+  // Appends the pairs of visible[begin..end), each primitive's tile rows from top to bottom, to `out`, which has room
+  // for `capacity`. Returns the index of the first primitive that did not fit (or `end`); `written` receives the number
+  // of pairs.
   int64_t (*bin)(const BinParams&, int64_t begin, int64_t end, LoosePair* out, int64_t capacity, int64_t* written);
 };
 
 struct ImageKernels {
-  // Gradient of rows [begin, end) of a channel in one of its photometric_tiles(width) tiles of columns; adds each row's
-  // sums of weight times |d|, d^2 and 1 - SSIM to row_sums (H,3). No row's results depend on which rows a call takes.
-  // `buffer` is the calling thread's own, photometric_buffer_size(width) floats.
+  // Computes the gradient of rows [begin, end) of a channel in one of its photometric_tiles(width) tiles of columns;
+  // adds each row's sums of weight times |d|, d^2 and 1 - SSIM to row_sums (H,3). A row's results do not depend on the
+  // other rows of the call. `buffer` belongs to the calling thread: photometric_buffer_size(width) floats.
   void (*photometric)(const PhotometricParams&, int channel, int tile, int begin, int end, float* buffer,
                       double* row_sums);
   void (*adam)(const AdamParams&, int64_t begin, int64_t end);
@@ -167,8 +168,8 @@ inline int photometric_columns(int width) {
 inline int photometric_tiles(int width) {
   return (width + photometric_columns(width) - 1) / photometric_columns(width);
 }
-// Floats of a row of a tile: two cache lines more on either side, and an odd number of lines, which spreads the rows
-// over the cache.
+// Floats per row of a tile: two extra cache lines on either side, and an odd number of lines, which distributes the
+// rows over the cache.
 inline int64_t photometric_pitch(int width) { return ((photometric_columns(width) / kSsimAlign + 4) | 1) * kSsimAlign; }
 inline int64_t photometric_buffer_size(int width) {
   return ((4 + 3) * 3 * kSsimRows + 4 * kSsimRows + 2) * photometric_pitch(width) + kSsimAlign;

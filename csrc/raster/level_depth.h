@@ -1,4 +1,4 @@
-// Depth at a transmittance level by exact overlap, for meshes: no order, no colour, no gradient.
+// Depth maps at a given transmittance with exact overlap, for meshing: no order, no colour, no gradient.
 #pragma once
 
 #include <limits>
@@ -7,10 +7,11 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// Where the transmittance of one tile's rays falls to `level`, all primitives absorbing where they are, overlaps
-// included: sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any
-// order and grows with t, so it is bisected. `scratch` holds 3 * 16 values per pair of the longest tile list. Writes
-// out.depth_median, 0 where never, and out.opacity, which does not depend on the order either.
+// Computes where the transmittance of one tile's rays falls to `level`, with densities added up where primitives
+// overlap: sum_i density_i |v| clamp(t - t_in_i, 0, t_out_i - t_in_i) = ln(1 / level). The sum does not depend on any
+// order and grows with t, so the equation is solved by bisection. `scratch` holds 3 * 16 values per pair of the longest
+// tile list. Writes out.depth_median, 0 if the level is never reached, and out.opacity, which does not depend on the
+// order either.
 template <class Kind>
 void level_depth_tile(const RasterParams<typename Kind::Real>& P, int tile, typename Kind::Real* scratch) {
   using Real = typename Kind::Real;
@@ -19,7 +20,7 @@ void level_depth_tile(const RasterParams<typename Kind::Real>& P, int tile, type
   using V = typename T::V;
   using M = typename T::M;
   using I = typename T::I;
-  constexpr int kMostHalvings = sizeof(Real) == 4 ? 80 : 140;  // enough from any bracket; far fewer are the rule
+  constexpr int kMostHalvings = sizeof(Real) == 4 ? 80 : 140;  // enough for any bracket; far fewer are usual
   const V resolution = V::set(Real(2) * std::numeric_limits<Real>::epsilon());
   const View& view = P.view;
   const int tile_x = tile % P.tiles_x * kTile, tile_y = tile / P.tiles_x * kTile;

@@ -1,5 +1,5 @@
-// What one core can do at this moment: peak multiply-adds, the vector exponential, and the bare work of one (primitive,
-// tile) pair with all data at hand and every pixel hit. The rasterizer's speed is stated as a ratio to these
+// Measures the current speed of one core: peak multiply-adds, the vector exponential, and the bare work per (primitive,
+// tile) pair with all data in cache and every pixel hit. The rasterizer's speed is reported as a ratio to these
 // (tools/bench.py).
 #pragma once
 
@@ -10,7 +10,7 @@
 
 namespace linprim::LINPRIM_ISA {
 
-// Shortest of `repeats` timings of `work`, nanoseconds.
+// Returns the shortest of `repeats` timings of `work`, in nanoseconds.
 template <class Work>
 inline double shortest_ns(int repeats, Work work) {
   double best = 1e30;
@@ -58,7 +58,8 @@ Limits measure_limits() {
     limits.exp_ns = ns / kValues;
   }
 
-  // Octahedra in front of a camera of 600 pixels focal length, all of a tile inside each, thin enough that no ray ends.
+  // Octahedra in front of a camera with a focal length of 600 pixels. Each covers the whole tile, and all are so thin
+  // that no ray ends.
   constexpr int kPairs = 32;
   View view{};
   view.fx = view.fy = 600, view.cx = view.cy = 8, view.width = view.height = kTile, view.near = 0.01, view.stop = 1e-3,

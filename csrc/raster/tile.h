@@ -1,7 +1,8 @@
-// What every tile kernel needs: a tile's pixels in blocks of lanes, the mean depth inside a slice, sums over lanes.
+// Common parts of the tile kernels: a tile's pixels in blocks of SIMD lanes, the mean depth inside a slice, sums over
+// lanes.
 //
-// W lanes cover a part of a 4x4 block of pixels (all of it for W = 16). Per-pixel state lives in arrays of 256, block
-// after block.
+// W lanes cover a part of a 4x4 block of pixels (all of it for W = 16). Per-pixel state is stored in arrays of 256,
+// block by block.
 #pragma once
 
 #include <algorithm>
@@ -39,7 +40,7 @@ struct Tile {
   static int part_x(int part) { return W < kBlock ? part % kBlock : 0; }
   static int part_y(int part) { return W < kBlock ? part / kBlock : part * kPartHeight; }
 
-  // Length of the ray (u, v, 1) through each pixel of the tile, in the order of the state arrays.
+  // Computes the length of the ray (u, v, 1) through each pixel of the tile, in the order of the state arrays.
   static void ray_lengths(const View& view, int tile_x, int tile_y, Real* out) {
     alignas(64) Real uu[kTile], vv[kTile];
     const double fx = 1 / view.fx, fy = 1 / view.fy;
@@ -51,8 +52,8 @@ struct Tile {
       for (int x = 0; x < kBlock; ++x) out[i + x] = uu[4 * (i / 16 & 3) + x] + vv[4 * (i / 64) + i % 16 / 4];
     for (int i = 0; i < kTilePixels; i += W) sqrt(V::load(out + i)).store(out + i);
   }
-  // A tile's part of an image plane into the order of the state arrays, 0 outside the image (and where there is no
-  // plane).
+  // Copies a tile's part of an image plane to the order of the state arrays, 0 outside the image (or everywhere without
+  // a plane).
   static void load(const View& view, int tile_x, int tile_y, const Real* plane, Real* state) {
     if (!plane) {
       std::fill(state, state + kTilePixels, Real(0));
@@ -74,7 +75,7 @@ struct Tile {
         [&](int64_t at, int from) { std::memcpy(plane + at, state + from, kBlock * sizeof(Real)); });
   }
   // Calls row(index into a plane, index into a state array, pixels inside the image, 0 to 4) for the 64 rows of the 16
-  // blocks, or, where all of the tile is inside, whole(index into a plane, index into a state array).
+  // blocks; if the whole tile is inside the image, calls whole(index into a plane, index into a state array).
   template <class Row, class Whole>
   static void each_row_of_four(const View& view, int tile_x, int tile_y, Row row, Whole whole) {
     const bool inside = tile_x + kTile <= view.width && tile_y + kTile <= view.height;
@@ -90,8 +91,8 @@ struct Tile {
       }
     }
   }
-  // 1 for pixels of the image, -1 (a transmittance never at or above `stop`, so never hit) for the others; returns the
-  // blocks with any.
+  // Sets the transmittance to 1 for pixels of the image and to -1 for the others, which is never at or above `stop`, so
+  // they are never hit. Returns the blocks that contain pixels of the image.
   static unsigned start(const View& view, int tile_x, int tile_y, Real* through) {
     unsigned alive = 0;
     each_row_of_four(
@@ -108,7 +109,7 @@ struct Tile {
   }
 };
 
-// Mean position, in units of the slice, of what is absorbed in a slice of optical thickness tau, and its derivative:
+// Mean position, relative to the slice, of the light absorbed in a slice of optical thickness tau, and its derivative:
 // g = 1/tau - 1/(e^tau - 1), from 1/2 (thin) to 0 (opaque); a series below 0.3, where the difference would cancel.
 template <class Real, int W>
 inline void mean_in_slice(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> through, Vec<Real, W>& g,
@@ -132,13 +133,13 @@ inline void mean_in_slice(Vec<Real, W> tau, Vec<Real, W> alpha, Vec<Real, W> thr
                  fma(over * rcp(select(thin, V::set(1), alpha)), V::set(1), V::set(0) - inverse * inverse));
 }
 
-// Sums of `count` accumulators over their lanes.
+// Sums each of `count` accumulators over its lanes.
 template <class Real, int W>
 inline void reduce(const Vec<Real, W>* sums, int count, Real* out) {
   for (int i = 0; i < count; ++i) out[i] = sum(sums[i]);
 }
 #if defined(LINPRIM_ISA_V4)
-// Sixteen accumulators at a time by a tree of half-adds: 45 instructions for 16 sums.
+// Sixteen accumulators at a time with a tree of half-adds: 45 instructions for 16 sums.
 template <>
 inline void reduce<float, 16>(const F16* a, int count, float* out) {
   for (int group = 0; group < count; group += 16, a += 16, out += 16) {
@@ -157,7 +158,7 @@ inline void reduce<float, 16>(const F16* a, int count, float* out) {
 }
 #endif
 #if defined(LINPRIM_ISA_V3)
-// Eight accumulators at a time: horizontal adds inside the halves, then the halves.
+// Eight accumulators at a time: horizontal adds inside the halves, then across the halves.
 template <>
 inline void reduce<float, 8>(const F8* a, int count, float* out) {
   for (int group = 0; group < count; group += 8, a += 8, out += 8) {

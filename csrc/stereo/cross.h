@@ -1,4 +1,4 @@
-// Which pixels around one belong to it: those that no edge of the photograph parts from it.
+// Cross-shaped regions: the pixels around each pixel that no edge of the photograph separates from it.
 #pragma once
 
 #include <algorithm>
@@ -10,12 +10,12 @@
 
 namespace linprim {
 
-// A cross reaches so many pixels in each direction, about twice as far as a window of PatchMatch holds a surface beyond
-// its edge. Up and down it ends where grey values differ from the pixel's by this much, and to the sides where they do
-// from those of the pixel in the middle of the row.
+// kCrossReach: largest length of a cross's arms in pixels, about twice as far as a window of PatchMatch extends a
+// surface beyond its edge. kCrossGrey: difference in grey values that ends an arm; up and down it is measured from the
+// centre pixel, to the sides from the pixel in the middle of the row.
 constexpr int kCrossReach = 10, kCrossGrey = 25;
 
-// Of every pixel of a photograph the pixels alike up and down, and to the left and right of each of these. Source:
+// For every pixel of a photograph, the similar pixels up and down, and to the left and right of each of these. Source:
 // Zhang, Lu, Lafruit 2009, cross-based local stereo matching.
 class Crosses {
  public:
@@ -29,7 +29,7 @@ class Crosses {
     });
   }
 
-  // body(at) for every pixel, on several threads.
+  // Calls body(at) for every pixel, on several threads.
   template <class Body>
   void for_each_pixel(Body body) const {
     parallel_for(int64_t(arms_.size()) / width_, [&](int64_t row, int) {
@@ -37,7 +37,8 @@ class Crosses {
     });
   }
 
-  // body(y, pixel of row y above or below that at `at`, how far the cross reaches to its left and right)
+  // Calls body(y, pixel in row y above or below the pixel `at`, arm lengths to its left and right) for each row of the
+  // cross.
   template <class Body>
   void for_each_row(int64_t at, Body body) const {
     for (int y = -arms_[at].up; y <= arms_[at].down; ++y) {
@@ -51,7 +52,7 @@ class Crosses {
     uint8_t left, right, up, down;
   };
 
-  // How many pixels from `at` on, every `step`, are like it.
+  // Returns how many pixels after `at`, at distances of `step`, are similar to it.
   static uint8_t arm(const uint8_t* at, int64_t step, int room) {
     const int most = std::min(kCrossReach, room);
     int length = 0;

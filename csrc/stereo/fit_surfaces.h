@@ -1,4 +1,4 @@
-// Depths of pixels by what lies around them, within the edges of the photograph.
+// Smooths stereo depths by fitting surfaces to the pixels around, within the edges of the photograph.
 #pragma once
 
 #include <cstdint>
@@ -7,34 +7,35 @@
 
 namespace linprim {
 
-// Of a pixel's cross (stereo/cross.h) only the planes in every kCandidateStep-th row and column, counted from the
-// pixel, are tried. They are judged by so many tolerances, each half of the one before.
+// Only the planes in every kCandidateStep-th row and column of a pixel's cross (stereo/cross.h), counted from the
+// pixel, are candidates. They are rated with kScales tolerances, each half of the previous one.
 constexpr int kCandidateStep = 5, kScales = 4;
-// Surfaces are fitted to so many pixels at least, twice as many as the most terms that they have, in so many rounds.
+// Surfaces are fitted to at least kFewestFitted pixels, twice as many as they have terms at most, in kFitRounds rounds.
 constexpr int kFewestFitted = 12, kFitRounds = 2;
 
-// Fits a surface of inverse depth around every pixel, and takes its tangent plane at the pixel.
+// Fits a surface of inverse depth around every pixel, and returns its tangent plane at the pixel.
 //
-// A pixel starts from its own plane or one that is tried: that on which the most of its cross lies, in the sum over the
-// tolerances, of those on which more than half lies within `tolerance`, a share of the inverse depth. Without such a
-// plane the pixel keeps its own. Then a surface of second order is fitted, in rounds, to what lies on it of the square
-// around the pixel, as wide as crosses are, within the narrowest of the tolerances that more than half of the cross
-// keeps. The pixel keeps the plane that it starts from if there are too few to fit, or if the surface would move it by
-// more than `tolerance`.
+// Candidates are the pixel's own plane and those of the cross. The candidate with the most pixels of the cross on it is
+// selected, by the sum of the counts over the tolerances; more than half of the cross must lie within `tolerance`,
+// relative to inverse depth. If there is no such candidate, the pixel keeps its own plane. Then a second-order surface
+// is fitted, in rounds, to the pixels that lie on it in the square around the pixel, as wide as crosses are, within the
+// narrowest of the tolerances that contains more than half of the cross. The pixel gets the selected plane unchanged if
+// there are too few pixels to fit, or if the surface would move it by more than `tolerance`.
 //
-// `plane` holds inverse depths, not positive where they are unknown, then their change per column, then per row, each
-// (height, width), as does `fitted`. In `fitted_cost` pixels that start from a plane beyond `tolerance` from their own
-// have the mean `cost` of those of their cross on that plane, others their own. `tolerance` is between 0 and 1.
+// `plane` holds inverse depths, not positive where unknown, then their slopes per column, then per row, each (height,
+// width); so does `fitted`. In `fitted_cost`, pixels whose selected plane differs from their own by more than
+// `tolerance` have the mean `cost` of the pixels of their cross on that plane, others their own cost. `tolerance` is
+// between 0 and 1.
 void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, int height, int width, float tolerance,
                   float* fitted, float* fitted_cost);
 
 constexpr int kRoomAfter = 16;  // floats that a kernel may read after an image: its widest vector
 
-// What `fit_surfaces` is given, for the rows of the kernels in fit_surfaces_kernel.cpp.
+// Arguments of `fit_surfaces` for the row kernels in fit_surfaces_kernel.cpp.
 struct SurfaceFit {
   const Crosses& crosses;
   int height, width;
-  const float *inverse, *right_slope, *down_slope;  // kRoomAfter floats more of `inverse`
+  const float *inverse, *right_slope, *down_slope;  // padded by kRoomAfter floats after `inverse`
   const float* cost;
   float tolerance;
   float *fitted, *fitted_cost;

@@ -1,4 +1,4 @@
-// How well a plane carries the shading of a plain region into another photograph, and how to move it.
+// Measures how well a plane maps the shading of a plain region into another photograph, and how to improve the plane.
 #pragma once
 
 #include <cstdint>
@@ -15,20 +15,21 @@ struct ShadedPair {
   int height, width;     // of the other photograph, in which
   const float* means;    // (height, width, 3) are means of boxes and their slopes per column and row,
   const uint8_t* plain;  // and (height, width) says where a box has no edge
-  double moves[9];       // (3, 3), how the plane changes by each of three parameters
-  int64_t least;         // fewer boxes that both show say nothing
+  double moves[9];       // (3, 3), change of the plane by each of three parameters
+  int64_t least;         // smallest number of boxes visible in both
 };
 
-// What compare_shading finds: how many boxes both photographs show, 0 for fewer than `least`; the weighted variance of
-// what is left of them, and the variance of their own values; Gauss-Newton's matrix and right side for the parameters.
+// Result of compare_shading: the number of boxes visible in both photographs, 0 if fewer than `least`; the weighted
+// variance of the residuals, and the variance of the values themselves; Gauss-Newton matrix and right side for the
+// parameters.
 struct ShadedComparison {
   int64_t boxes;
   double left_variance, variance;
   double information[9], downhill[3];
 };
 
-// Writes per box whether the other photograph shows it without an edge (`shown`), and what is left of its value after
-// an offset, a gain and the gain's bend (`left`, 0 where it is not shown).
+// Writes for each box whether the other photograph shows it without an edge (`shown`), and the residual of its value
+// after fitting an offset, a gain and the gain's bend (`left`, 0 where it is not shown).
 ShadedComparison compare_shading(const ShadedPair& pair, uint8_t* shown, double* left);
 
 }  // namespace linprim

@@ -1,4 +1,4 @@
-// Floats and integers of as many pixels as an instruction set takes at once; base/lanes.h has doubles by the same
+// SIMD vectors of floats and integers, as wide as the instruction set; base/lanes.h has doubles with the same function
 // names. For files that are compiled once per instruction set, with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1.
 #pragma once
 
