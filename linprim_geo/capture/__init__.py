@@ -1,1 +1,1 @@
-"""A folder of photographs, or a video, becomes a `Scene`."""
+"""Captures: from a folder of photographs, or a video, to a `Scene`."""

@@ -1,4 +1,4 @@
-"""Poses of a capture after `stereo.adjust_poses`, as a file of a run and of the cache folder keep them."""
+"""Poses of a capture after bundle adjustment (`stereo.adjust_poses`), as stored in a run and in the cache folder."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ from linprim_geo.geometry.lens import zoomed
 
 @dataclass(frozen=True)
 class AdjustedPoses:
-    """World to camera (4, 4) by the names of views, none where the given poses are as good; a factor of all focal
-    lengths; and by how many pixels the given poses are taken to err, root mean square."""
+    """Adjusted poses of a capture.
+
+    `poses`: world-to-camera matrices (4, 4) by view name; empty if the given poses are as good. `focal_factor`: factor
+    of all focal lengths. `error_px`: estimated root mean square error of the given poses in pixels.
+    """
 
     poses: dict[str, np.ndarray]
     focal_factor: float
     error_px: float
 
     def applied(self, scene: Scene) -> Scene:
-        """The scene with these poses; views without one keep theirs."""
+        """Return the scene with these poses; views without one keep theirs."""
 
         def moved(view: View) -> View:
             pose, own = self.poses.get(view.name, view.camera.world_to_camera), view.camera
@@ -35,14 +38,14 @@ class AdjustedPoses:
         return replace(scene, train=train, test=test, adjusted=self)
 
     def write(self, path: Path) -> None:
-        """Raises LinprimError if that fails."""
+        """Write the poses to a JSON file. Raises LinprimError if that fails."""
         about = "world to camera by photograph (x right, y down, z forward), in place of the capture's own poses"
         numbers = {"error_px": self.error_px, "focal_factor": self.focal_factor}
         write_json(path, {"about": about, **numbers, "poses": self.poses})
 
     @staticmethod
     def read(path: Path) -> AdjustedPoses:
-        """Raises LinprimError for a file that holds no such poses."""
+        """Read a file of adjusted poses. Raises LinprimError if it holds none."""
         saved = read_json(path, "adjusted poses")
         try:
             if not isinstance(saved, dict):
@@ -55,5 +58,5 @@ class AdjustedPoses:
             wanted = "error_px, focal_factor, and 4 by 4 numbers for each of the poses"
             raise LinprimError(f"{path}: holds no adjusted poses, wanted {wanted}") from None
         for pose in poses.values():
-            check_pose(pose, str(path))  # taken as they are: a run goes on with the same bits
+            check_pose(pose, str(path))  # checked but kept unchanged, so that a resumed run computes with the same bits
         return AdjustedPoses(poses, factor, error)

@@ -1,4 +1,4 @@
-"""Poses that were found for plain photographs: where they are kept, and whether they can be used."""
+"""Poses found for photographs without poses: where they are stored, and whether they are good enough to use."""
 
 from __future__ import annotations
 
@@ -16,31 +16,34 @@ from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, SEED
 from linprim_geo.capture.readers.colmap import has_model
 from linprim_geo.imaging import photos
 
-# Changed whenever the poses come out differently or are judged otherwise, so that old cache entries are not found
-# any more.
+# Raised whenever the poses or their assessment change, so that old cache entries are not used any more.
 _CACHE_VERSION = 3
-# Where photographs lie in a capture's folder; in the first that has any. Those in the folder itself are not looked for
-# any deeper.
+# Subfolders of a capture that may contain its photographs; the first with any is used. The capture's own folder (".")
+# is not searched recursively.
 _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
-# Pillow's names of the formats that pycolmap reads; photographs in others are copied, in the folder of the result while
-# they are needed.
+# Pillow's names of the formats that pycolmap reads. Photographs in other formats are converted into a temporary folder
+# beside the result.
 _FORMATS, _COPIES = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), "copies"
-# Counts and pixels of a verdict are below this.
+# Upper limit of plausible counts and pixels in a stored verdict.
 _LARGEST = 1e12
-# What can be trained, and what is trained with a warning.
+# Smallest share of photographs with poses that can be trained; below _GOOD_SHARE, or with worse values than the others,
+# a warning is given.
 _MIN_SHARE = 0.5
 _GOOD_SHARE = 0.9
 _GOOD_ERROR_PX = 1.0
 _GOOD_TRACK = 3.0
-# Names in a message.
+# Largest number of file names in a message.
 _LISTED = 6
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of the photographs: how many have a pose, the points, the mean reprojection error in pixels, the mean
-    number of photographs that see a point, the names of those without a pose, and of those whose pose most of their
-    matches contradict; and whether it was tried to refine the poses."""
+    """Result of structure from motion.
+
+    Number of photographs, number with a pose, number of points, mean reprojection error in pixels, mean number of
+    photographs that see a point (track length), names of photographs without a pose (`left_out`), names of photographs
+    whose pose contradicts most of their matches (`misplaced`), and whether refining the poses was tried.
+    """
 
     photographs: int
     registered: int
@@ -59,12 +62,12 @@ class Verdict:
 
     @property
     def unusable(self) -> bool:
-        """Whether too few photographs are left to train: fewer than three, or less than half."""
+        """Return whether too few photographs have poses to train: fewer than three, or less than half."""
         return self.registered < max(MIN_REGISTERED, _MIN_SHARE * self.photographs)
 
     @property
     def doubts(self) -> str:
-        """What makes the poses poor and what helps, "" if nothing does."""
+        """Return why the poses are poor and how to improve them, or ""."""
         poor = []
         if self.registered < _GOOD_SHARE * self.photographs:
             missing = self.photographs - self.registered
@@ -85,7 +88,7 @@ class Verdict:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """The first names in brackets, and how many there are beside them."""
+    """Return the first names in brackets, and the number of further ones."""
     if not names:
         return ""
     more = len(names) - _LISTED
@@ -93,7 +96,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def photographs(root: Path) -> tuple[Path, list[str]]:
-    """The folder of a capture's photographs and their paths in it, sorted; an empty list if there are none."""
+    """Return the folder of a capture's photographs and their sorted paths in it; an empty list if there are none."""
     for name in _PHOTO_FOLDERS:
         folder = root / name
         if folder.is_dir():
@@ -106,10 +109,10 @@ def photographs(root: Path) -> tuple[Path, list[str]]:
 
 
 def frames_of(path: Path, frames: int, cache: Path | None = None) -> Path:
-    """The folder that `prepare` has extracted a video's frames to; anything else is returned as it is.
+    """Return the folder of frames that `prepare` has extracted from a video; any other path is returned unchanged.
 
     Raises:
-        LinprimError: they were not extracted yet.
+        LinprimError: the frames were not extracted yet.
     """
     if not video_frames.is_video(path):
         return path
@@ -122,10 +125,11 @@ def frames_of(path: Path, frames: int, cache: Path | None = None) -> Path:
 
 
 def found_model(root: Path, cache: Path | None = None) -> Path | None:
-    """The folder of the COLMAP model that `find_poses` has made of the photographs in `root`; None if it has not.
+    """Return the folder of the COLMAP model that `find_poses` has made of the photographs in `root`, or None if there
+    is none.
 
     Raises:
-        LinprimError: it has, and the model cannot be used.
+        LinprimError: there is one, but it cannot be used.
     """
     folder, names = photographs(root)
     if not names or not (base := _base(cache)).is_dir():
@@ -151,7 +155,8 @@ def _base(cache: Path | None) -> Path:
 
 
 def _key(folder: Path, names: Sequence[str]) -> str:
-    """Of the names and contents of the photographs; neither where they lie nor the number of threads matter."""
+    """Return a cache key from the names and contents of the photographs; their location and the number of threads do
+    not matter."""
     digest = hashlib.blake2b(repr((_CACHE_VERSION, SEED)).encode(), digest_size=16)
     for name in names:
         try:
@@ -163,7 +168,7 @@ def _key(folder: Path, names: Sequence[str]) -> str:
 
 
 def _stored(kept: Path) -> Verdict | None:
-    """What is said of the result in a folder; None if there is none, or one that is of no use and made again."""
+    """Return the verdict stored in a folder, or None if there is none or it is unusable; it is then made again."""
     try:
         verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
         *numbers, left_out, misplaced, refined = astuple(verdict)
@@ -178,8 +183,8 @@ def _stored(kept: Path) -> Verdict | None:
 
 
 def _readable(folder: Path, names: Sequence[str], kept: Path) -> Path:
-    """The folder itself if pycolmap can read all its photographs, else one of copies by the same names; those which it
-    cannot, as PNG."""
+    """Return the folder itself if pycolmap can read all its photographs, else a folder of copies with the same names,
+    in which unreadable formats are converted to PNG."""
     from PIL import Image
 
     if all(photos.image_format(folder / name) in _FORMATS for name in names):

@@ -1,4 +1,4 @@
-"""Folders beside a capture's photographs: masks, and the same photographs in another size, in a folder that is named or
+"""Folders beside a capture's photographs: masks, and the same photographs in another size, in a named folder or in
 Mip-NeRF 360's `images_2`, `images_4` and `images_8`."""
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from linprim_geo.imaging import photos
 
 
 def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
-    """The frames with their photographs from `folder`, found by path or name with any suffix, and cameras scaled to
-    their size.
+    """Return the frames with their photographs taken from `folder`, matched by path or name with any suffix, and their
+    cameras scaled to the size of these.
 
     Raises:
-        LinprimError: one is missing, is that of two cameras, or is of another shape than its camera's.
+        LinprimError: a photograph is missing, matches two cameras, or has another aspect ratio than its camera.
     """
     found, missing = [], []
     for frame in frames:
@@ -38,7 +38,7 @@ def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
                 "each camera"
             )
         (width, height), lens = photos.image_header(image)[:2], frame.lens
-        # Sizes that were rounded to whole pixels, either way, differ by less than a pixel each.
+        # Rounding both sizes to whole pixels, in either direction, changes each by less than a pixel.
         if abs(width * lens.height - height * lens.width) > lens.width + lens.height:
             raise LinprimError(
                 f"{image}: the image is {width}x{height}, wanted the shape of {lens.width}x{lens.height} in any size"
@@ -48,10 +48,10 @@ def with_images(frames: Sequence[Frame], folder: Path) -> list[Frame]:
 
 
 def with_smaller_images(frames: Sequence[Frame], root: Path, factor: int) -> list[Frame] | None:
-    """The frames with photographs that were made smaller by `factor` already, in a folder `NAME_factor` beside NAME,
+    """Return the frames with photographs that are already reduced by `factor`, from a folder `NAME_factor` beside NAME,
     both below `root`.
 
-    None where one of them is missing or has another size, or where masks, depth maps or normals would not fit them.
+    Return None if one of them is missing or has another size, or if masks, depth maps or normals would not fit them.
     """
     if factor == 1 or any(frame.mask_path or frame.depth_path or frame.normal_path for frame in frames):
         return None
@@ -73,7 +73,8 @@ def with_smaller_images(frames: Sequence[Frame], root: Path, factor: int) -> lis
 
 
 def _beside(relative: str, folder: Path) -> Path | None:
-    """The image of a path in `folder`: of the whole path, without its first folder, or of the name alone."""
+    """Return the image in `folder` that matches a path: the whole path, the path without its first folder, or the name
+    alone."""
     path = Path(relative)
     inner = Path(*path.parts[1:]) if len(path.parts) > 1 else path
     return next(
@@ -83,16 +84,17 @@ def _beside(relative: str, folder: Path) -> Path | None:
 
 
 def _same(path: Path) -> Path | None:
-    """The image at a path, or one that differs by its suffix alone."""
+    """Return the image at a path, or one that differs only in its suffix."""
     suffixes = (path.suffix, *photos.IMAGE_SUFFIXES, ".JPG", ".PNG")
     return next((found for suffix in suffixes if is_file(found := path.with_suffix(suffix))), None)
 
 
 def with_masks(frames: Sequence[Frame], root: Path, folder: Path | None) -> list[Frame]:
-    """Gives every frame its mask file; a folder found by itself that fits no frame at all is left alone.
+    """Return the frames with their mask files. A mask folder that was found automatically but fits no frame at all is
+    ignored.
 
     Raises:
-        LinprimError: a mask is missing in a folder that was named, or that has others.
+        LinprimError: a mask is missing in a folder that was given, or that contains masks of other frames.
     """
     if folder is None and any(frame.mask_path for frame in frames):
         return list(frames)

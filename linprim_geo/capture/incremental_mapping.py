@@ -1,4 +1,4 @@
-"""The steps of structure from motion by pycolmap on the CPU: keypoints, matches, incremental mapping, from one folder
+"""The steps of structure from motion by pycolmap on the CPU: keypoints, matching, incremental mapping, for one folder
 of photographs."""
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import numpy as np
 
 from linprim_geo.capture.pair_agreement import VerifiedPairs
 
-# Up to this many photographs every pair is matched; of more, each with those that share most of their largest
-# keypoints, and with the next ones by name, as they were taken one after the other.
+# Up to _MATCH_ALL photographs, every pair is matched. With more, each is matched with the _PARTNERS that share most of
+# its largest keypoints, and with the next _NEXT_BY_NAME by name, because they were probably taken one after the other.
 _MATCH_ALL = 60
 _PARTNERS = 15
 _NEXT_BY_NAME = 5
 _LARGEST_KEYPOINTS = 256
-# Two descriptors are taken for the same if the next best is at least this much farther away.
+# Largest ratio of the distances to the nearest and second nearest descriptor for a match (Lowe's ratio).
 _MAX_RATIO = 0.8
 
 
 def pairs_to_match(database, count: int) -> list[tuple[int, int]]:
-    """Pairs (i < j) of photographs worth matching, counted from 0."""
+    """Return the pairs (i < j) of photographs to match, counted from 0."""
     if count <= _MATCH_ALL:
         return [(i, j) for i in range(count) for j in range(i + 1, count)]
     descriptors = [_largest(database, index + 1) for index in range(count)]
@@ -40,19 +40,19 @@ def pairs_to_match(database, count: int) -> list[tuple[int, int]]:
 
 
 def _largest(database, image: int) -> np.ndarray:
-    """(K, 128) float32 unit descriptors of the largest keypoints of a photograph."""
+    """Return (K, 128) float32 unit descriptors of the largest keypoints of a photograph."""
     if not database.exists_descriptors(image) or not database.num_descriptors_for_image(image):
         return np.zeros((0, 128), np.float32)
     keypoints = database.read_keypoints(image)
     descriptors = database.read_descriptors(image).data
-    # The area of the affine shape that the last four numbers of a keypoint are.
+    # The area of a keypoint's affine shape, given by its last four numbers.
     scale = np.abs(keypoints[:, 2] * keypoints[:, 5] - keypoints[:, 3] * keypoints[:, 4])
     chosen = descriptors[np.argsort(-scale, kind="stable")[:_LARGEST_KEYPOINTS]].astype(np.float32)
     return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1.0)
 
 
 def _common(first: np.ndarray, second: np.ndarray) -> int:
-    """How many descriptors of two photographs are each other's nearest and have no other that is nearly as near."""
+    """Return the number of mutual nearest descriptors of two photographs that pass the ratio test."""
     if len(first) < 2 or len(second) < 2:
         return 0
     cosine = first @ second.T
@@ -62,24 +62,24 @@ def _common(first: np.ndarray, second: np.ndarray) -> int:
     return int(((back[nearest] == np.arange(len(first))) & (two[:, 1] < _MAX_RATIO**2 * two[:, 0])).sum())
 
 
-# Keypoints are looked for at this many pixels along the longer side; more takes long and finds few that can be matched.
+# Keypoints are detected at this many pixels along the longer side; more takes long and adds few that can be matched.
 _WIDEST = 2000
 _MAX_FEATURES = 4096
-# Below COLMAP's 0.0067, as plain walls and renderings have few strong features; far below, weak ones crowd out the
-# others.
+# Below COLMAP's 0.0067, because plain walls and renderings have few strong features; much lower, weak features crowd
+# out the others.
 _PEAK_THRESHOLD = 0.004
-# Work between two lines of progress, and two moments at which it can be interrupted.
+# Number of photographs or pairs per call of pycolmap: progress is reported and interruption is possible between calls.
 _IMAGES_AT_ONCE = 4
 _PAIRS_AT_ONCE = 40
 _SECONDS_BETWEEN_LINES = 20.0
 SEED = 0
-# A model of fewer photographs is none.
+# Smallest number of photographs in a model.
 MIN_REGISTERED = 3
-# Where COLMAP's demands on a photograph's match with the model (30 matches, a quarter of them right) leave some out,
-# these are tried.
+# Relaxed criteria for registering a photograph with the model, used if COLMAP's own (30 matches, a quarter of them
+# inliers) leave some out.
 _FEW_MATCHES, _FEW_RIGHT = 15, 0.1
-# Rounds in which all is adjusted at the end, of which the second changes focal lengths by 0.1 % at most; steps of
-# each, and the change of the sum of losses, as a share, at which it ends.
+# Final bundle adjustment: number of rounds, of which the second changes focal lengths by 0.1 % at most; iterations of
+# each; and the relative change of the cost at which a round ends.
 _ADJUSTMENTS, _ADJUSTING_STEPS, _ADJUSTED_TO = 2, 200, 1e-6
 
 
@@ -91,22 +91,22 @@ def largest_model(
     threads: int,
     say: Callable[[str], None],
 ):
-    """The largest `pycolmap.Reconstruction` that the photographs give, and the numbers of those, counted from 1, whose
-    poses in it most of their matches contradict; None and [] if they give none.
+    """Return the largest `pycolmap.Reconstruction` of the photographs, and the numbers, counted from 1, of those in it
+    whose poses contradict most of their matches; None and [] if there is none.
 
-    Keypoints and matches are kept in the folder `work`, and what is there already is not made again.
+    Keypoints and matches are stored in the folder `work`; existing ones are not computed again.
 
     Args:
-        folder, names, sizes: the photographs, of formats that pycolmap reads, with their (width, height).
+        folder, names, sizes: the photographs, in formats that pycolmap reads, with their (width, height).
         threads: 0 uses all cores.
-        say: is called with lines of progress.
+        say: called with lines of progress.
 
     Raises:
-        ValueError, RuntimeError, MemoryError: by pycolmap.
+        ValueError, RuntimeError, MemoryError: from pycolmap.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
-    # Otherwise there is a line about every image and pair.
+    # Otherwise pycolmap prints a line for every image and pair.
     pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 3)
     pycolmap.set_random_seed(SEED)
     database_path, threads = work / "database.db", threads or -1
@@ -117,20 +117,21 @@ def largest_model(
 
 
 def remove_work(work: Path) -> None:
-    """Removes what `largest_model` has kept."""
+    """Remove the files that `largest_model` has stored."""
     for leftover in work.glob("database.db*"):
         leftover.unlink()
 
 
 def _register(database_path: Path, folder: Path, names: list[str], sizes: list[tuple[int, int]]) -> None:
-    """Numbers the photographs by name and gives those of one folder, size and focal length one camera, once.
+    """Number the photographs by name, and assign one camera to those of the same folder, size and focal length. Done
+    once.
 
-    Left to itself, pycolmap numbers them in the order in which its threads finish them.
+    By default, pycolmap numbers them in the order in which its threads finish them.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     with pycolmap.Database.open(database_path) as database:
-        if database.num_frames() == len(names):  # written last
+        if database.num_frames() == len(names):  # all frames are written: the database is complete
             _rename(database, names)
             return
         database.clear_all_tables()
@@ -174,7 +175,8 @@ def _match(database_path: Path, work: Path, names: list[str], threads: int, say:
     with pycolmap.Database.open(database_path) as database:
         pairs = pairs_to_match(database, len(names))
         left = [pair for pair in pairs if not database.exists_two_view_geometry(pair[0] + 1, pair[1] + 1)]
-        # The list of pairs is split at blanks, which file names may have.
+        # pycolmap splits the list of pairs at blanks, which file names may contain, so photographs are renamed to
+        # numbers meanwhile.
         _rename(database, [str(index) for index in range(len(names))])
     for part in _in_parts(left, _PAIRS_AT_ONCE, "matches", "pairs", say):
         (work / "pairs.txt").write_text("".join(f"{i} {j}\n" for i, j in part))
@@ -199,8 +201,7 @@ def _rename(database, names: Sequence[str]) -> None:
 
 
 def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int, say: Callable[[str], None]):
-    """The largest of the models that incremental mapping makes, and its misplaced photographs; None and [] if there is
-    none."""
+    """Return the largest model of incremental mapping and its misplaced photographs; None and [] if there is none."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(random_seed=SEED, num_threads=threads, min_model_size=MIN_REGISTERED)
@@ -235,12 +236,11 @@ def _map(database_path: Path, folder: Path, work: Path, threads: int, count: int
 
 
 def adjust_robustly(model, most_px: float, least_degrees: float) -> None:
-    """Adjusts all poses, cameras and points of a reconstruction until nothing changes, observations by Cauchy's loss
-    with their median error for its scale; then leaves out observations that err by more than `most_px` and points with
-    less than `least_degrees` between their rays.
+    """Run bundle adjustment of all poses, cameras and points until convergence, with a Cauchy loss scaled by the median
+    error; then remove observations with errors above `most_px` and points whose rays span less than `least_degrees`.
 
-    Mapping counts all observations alike and stops early: wrong matches of a repeating pattern decide where nothing
-    else is strong, as about the focal length before a flat facade (DECISIONS 92).
+    Incremental mapping weights all observations equally and stops early. Wrong matches of a repeating pattern then
+    dominate where nothing else is well determined, such as the focal length in front of a flat facade (DECISIONS 92).
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -248,7 +248,7 @@ def adjust_robustly(model, most_px: float, least_degrees: float) -> None:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.max_num_iterations = _ADJUSTING_STEPS
     options.ceres.solver_options.function_tolerance = _ADJUSTED_TO
-    options.ceres.solver_options.num_threads = 1  # the same to the last bit
+    options.ceres.solver_options.num_threads = 1  # for bitwise reproducible results
     everything = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         everything.add_image(image)
@@ -265,7 +265,7 @@ def adjust_robustly(model, most_px: float, least_degrees: float) -> None:
 
 
 def _in_parts(items: list, size: int, name: str, unit: str, say: Callable[[str], None]) -> Iterator[list]:
-    """Parts of `items`, with a line now and then that says how many were done."""
+    """Yield parts of `items`, and report progress at intervals."""
     start = last = time.monotonic()
     for first in range(0, len(items), size):
         yield items[first : first + size]

@@ -1,7 +1,7 @@
-"""Loads a capture: posed views, their photographs, and the points that come with them.
+"""Load a capture: posed views, their photographs, and the points that come with them.
 
-`load_scene` finds out how a folder is laid out and checks everything that can be checked without decoding
-pixels; `View.load` decodes, undistorts and averages down.
+`load_scene` detects the layout of a folder and checks everything that can be checked without decoding pixels;
+`View.load` decodes, undistorts and averages down.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ from linprim_geo.geometry.lens import Intrinsics, Lens, check_lens, straightened
 from linprim_geo.imaging import photos
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
 
-# Of the images sorted by name, those whose index is a multiple of this are held out if the data set does
-# not say.
+# If the data set defines no split, images whose index (sorted by name) is a multiple of this are held out.
 HOLD_OUT_EVERY = 8
-# Options that name a folder.
+# Options whose value is a folder.
 _FOLDERS = ("masks", "images", "sparse")
-# Images decoded at load time to see whether an alpha channel holds anything but 255.
+# Number of images decoded at load time to find out whether an alpha channel contains values other than 255.
 _ALPHA_SAMPLES = 6
 
 
@@ -40,29 +39,29 @@ def load_scene(
     decoded: DecodedPhotos | None = None,
     **changes: Any,
 ) -> Scene:
-    """Reads a posed capture: `transforms*.json` (NeRF-synthetic, nerfstudio, instant-ngp), ScanNet++, a COLMAP model,
-    DTU's `cameras_sphere.npz`, TUM's lists, or a trajectory (`.log`) with depth maps or of Tanks and Temples, in this
-    order.
+    """Read a posed capture. Layouts are tried in this order: `transforms*.json` (NeRF-synthetic, nerfstudio,
+    instant-ngp), ScanNet++, a COLMAP model, DTU's `cameras_sphere.npz`, TUM's lists, a trajectory (`.log`) with depth
+    maps or of Tanks and Temples.
 
-    Photographs without poses, and videos, are read once `structure_from_motion.prepare` has found their poses.
+    Photographs without poses, and videos, can be read after `structure_from_motion.prepare` has found their poses.
 
-    Held out are the frames that the data set names so (`transforms_test.json`, else `_val`;
-    `test_filenames`; ScanNet++'s lists), else every 8th of the images sorted by name; or those that `test_every` says.
-    Points come with the transforms (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them.
-    Image headers are read, pixels are not (but for a few with alpha).
+    Held-out frames are those that the data set defines (`transforms_test.json`, else `_val`; `test_filenames`;
+    ScanNet++'s lists), else every 8th of the images sorted by name; or those selected by `test_every`. Points come with
+    the transforms (`ply_file_path`) or from a COLMAP model in the folder whose poses agree with them. Only image
+    headers are read, and the pixels of a few images with alpha.
 
     Args:
         path: the data set's folder, or a `.json` in it, or a video.
-        options: how it is read. With `downscale` cameras are scaled exactly; where all photographs are there in a
-            folder such as `images_4` beside `images`, smaller by that factor but for rounding, these are taken.
-            `masks` are named as the images, and found without it in `masks` or `mask`; `images` scales the cameras to
-            the size of these images. The pixels of `pinhole_below` are those of the averaged image.
-        cache: where undistorted images and poses that were found are kept, see `photos.cache_folder`.
-        decoded: photographs that an earlier reading of the capture has decoded; default: those of this one.
+        options: how it is read. With `downscale`, cameras are scaled exactly; if a folder such as `images_4` beside
+            `images` contains all photographs reduced by that factor (up to rounding), these are used. `masks` have the
+            same names as the images; without the option they are looked for in `masks` or `mask`. `images` scales the
+            cameras to the size of these images. `pinhole_below` is in pixels of the averaged image.
+        cache: folder for undistorted images and found poses, see `photos.cache_folder`.
+        decoded: photographs that an earlier reading of the capture has decoded; default: a new cache.
         changes: fields of `options` by name, such as `downscale=2`.
 
     Raises:
-        LinprimError: one sentence about the first thing that is missing, damaged or does not fit together.
+        LinprimError: one sentence about the first thing that is missing, damaged or inconsistent.
     """
     from linprim_geo.capture.image_folders import with_images, with_masks, with_smaller_images
     from linprim_geo.capture.readers import colmap as read_colmap
@@ -118,8 +117,8 @@ def load_scene(
 
 
 def told_downscale(scene: Scene, options: SceneOptions, log: Callable[[str], None]) -> int:
-    """The `downscale` of a scene that was read with `options`; where these left it open and it is not 1, `log` is
-    called with a line that says so."""
+    """Return the `downscale` with which a scene was read. If `options` left it open and it is not 1, report it to
+    `log`."""
     if options.downscale == "auto" and scene.downscale > 1:
         camera = scene.views[0].camera
         log(
@@ -130,7 +129,7 @@ def told_downscale(scene: Scene, options: SceneOptions, log: Callable[[str], Non
 
 
 def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
-    """Whether `load_scene` finds poses in a capture's folder, whatever they are worth; false for photographs alone.
+    """Return whether `load_scene` finds poses in a capture's folder, valid or not; False for photographs alone.
 
     Raises:
         LinprimError: there is no such folder.
@@ -142,7 +141,7 @@ def has_poses(path: Path, sparse: str | os.PathLike | None = None) -> bool:
 def _reader(
     root: Path, json_file: Path | None, sparse: Path | None, images: Path | None
 ) -> Callable[[], Listing] | None:
-    """What reads the first layout that the folder has; None if it has none."""
+    """Return the function that reads the first layout found in the folder, or None."""
     from linprim_geo.capture.readers import colmap as read_colmap
     from linprim_geo.capture.readers import dtu as read_dtu
     from linprim_geo.capture.readers import rgbd as read_rgbd
@@ -178,7 +177,7 @@ def _root(path: Path) -> tuple[Path, Path | None]:
 
 
 def _option_folder(value: str | os.PathLike | None, root: Path, option: str) -> Path | None:
-    """A folder given as an option, relative to the working folder or else to the scene."""
+    """Return a folder given as an option, relative to the working folder or else to the scene."""
     if not value:
         return None
     for folder in (Path(value), root / value):
@@ -188,8 +187,8 @@ def _option_folder(value: str | os.PathLike | None, root: Path, option: str) -> 
 
 
 def settled_folders(options: SceneOptions, root: Path) -> SceneOptions:
-    """`options` as a run keeps them, for commands that are called elsewhere: folders in the capture relative to it,
-    others absolute.
+    """Return `options` as a run stores them, valid for commands called from elsewhere: folders inside the capture
+    relative to it, others absolute.
 
     Raises:
         LinprimError: there is no such folder.
@@ -205,8 +204,8 @@ def settled_folders(options: SceneOptions, root: Path) -> SceneOptions:
 
 
 def in_capture(options: SceneOptions, path: Path) -> SceneOptions:
-    """A run's `options` for `load_scene`: folders that are in its capture stay those, whatever else has their names
-    where this is called."""
+    """Return a run's `options` for `load_scene`, with folders inside its capture made explicit, so that folders of the
+    same name in the working folder are not used."""
     root = path if path.is_dir() else path.parent
     named: dict[str, Any] = {name: getattr(options, name) for name in _FOLDERS}
     held = {name: str(root / value) for name, value in named.items() if value not in ("", "none")}
@@ -227,15 +226,16 @@ def _contents(root: Path) -> str:
 
 
 def _downscale(wanted: int | str, frames: Sequence[Frame]) -> int:
-    """What is `wanted`, or for auto the fewest pixels a side that leave LONGEST_SIDE of the largest photograph."""
+    """Return the `wanted` factor, or for "auto" the smallest one for which no photograph has more than LONGEST_SIDE
+    pixels a side."""
     if wanted != "auto":
         return int(wanted)
     return -(-max(max(frame.lens.width, frame.lens.height) for frame in frames) // LONGEST_SIDE)
 
 
 def _names(frames: Sequence[Frame]) -> list[str]:
-    """A name for every frame, unique and fit for a file: the image's stem, else as much of its path as it
-    takes."""
+    """Return a name for every frame, unique and valid as a file name: the image's stem, else as much of its path as
+    necessary."""
     paths = [Path(frame.relative.replace("\\", "/")) for frame in frames]
     options = (
         [path.stem for path in paths],
@@ -249,8 +249,7 @@ def _names(frames: Sequence[Frame]) -> list[str]:
 
 
 def _header_checks(frames: Sequence[Frame]) -> list[bool]:
-    """Compares every image, mask and depth file with its camera; returns which images have an alpha
-    channel."""
+    """Check every image, mask and depth file against its camera; return which images have an alpha channel."""
     missing = [frame for frame in frames if not is_file(frame.image_path)]
     if missing:
         raise LinprimError(
@@ -326,8 +325,8 @@ def _view(frame: Frame, name: str, factor: int, has_alpha: bool, cache: Path, pi
 def _split(
     frames: Sequence[Frame], views: Sequence[View], every: int | str
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """By what the frames say, else every 8th by name, unless `every` is a number; never fewer than two training
-    views."""
+    """Return training and held-out views: by the frames' own split, else every 8th by name, unless `every` is a number.
+    There are always at least two training views."""
     if every == "auto" and any(frame.split is not None for frame in frames):
         train = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split != "test")
         test = tuple(view for frame, view in zip(frames, views, strict=True) if frame.split == "test")

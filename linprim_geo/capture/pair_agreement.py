@@ -1,8 +1,8 @@
-"""Whether the poses of a reconstruction agree with the pairs of photographs that it was made from.
+"""Check whether the poses of a reconstruction agree with the matched pairs of photographs that it was made from.
 
-Where things repeat, as tiles and windows do, photographs of different places are matched; a few such pairs are enough
-for incremental mapping to glue parts of a capture together wrongly, and every point that is left still fits. The
-matches that mapping had to leave out tell.
+With repetitive structures such as tiles or windows, photographs of different places are matched. A few such pairs are
+enough for incremental mapping to join parts of a capture wrongly, while all remaining points still fit. The matches
+that mapping had to discard reveal this.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.feature_points import sampson_px
 
-# Matches agree with poses whose epipolar geometry they miss by at most this much; the errors that COLMAP allows.
+# Largest distance in pixels of matches from the epipolar geometry of the poses; the error that COLMAP allows.
 _AGREE_PX = 4.0
 
 
 @dataclass(frozen=True)
 class VerifiedPairs:
-    """Pairs of photographs whose matches obey one epipolar geometry.
+    """Pairs of photographs whose matches fit one epipolar geometry.
 
     Attributes:
-        pairs: (K, 2) numbers of photographs, counted from 1 as pycolmap does.
-        matches: K arrays (M, 2) of rows of the keypoints of both.
-        keypoints: (N, 2) in pixels of each photograph.
+        pairs: (K, 2) numbers of photographs, counted from 1 as in pycolmap.
+        matches: K arrays (M, 2) of keypoint indices in both photographs.
+        keypoints: (N, 2) positions in pixels for each photograph.
     """
 
     pairs: np.ndarray
@@ -35,7 +35,7 @@ class VerifiedPairs:
 
     @classmethod
     def read(cls, database_path: Path) -> VerifiedPairs:
-        """Those of a pycolmap database."""
+        """Read the verified pairs of a pycolmap database."""
         from linprim_geo.geometry.load_pycolmap import pycolmap
 
         with pycolmap.Database.open(database_path) as database:
@@ -49,13 +49,15 @@ class VerifiedPairs:
 
     @property
     def counts(self) -> np.ndarray:
-        """(K,) how many matches each pair has."""
+        """Return (K,) the number of matches of each pair."""
         return np.array([len(matches) for matches in self.matches], np.int64)
 
     def agreeing_matches(self, model) -> np.ndarray:
-        """(K,) how many matches of each pair agree with the poses of a `pycolmap.Reconstruction`: within 4 pixels of
-        their epipolar geometry (Sampson's distance), with lines of sight that meet before both cameras. 0 where the
-        model leaves a photograph out."""
+        """Return (K,) the number of matches of each pair that agree with the poses of a `pycolmap.Reconstruction`.
+
+        A match agrees if its Sampson distance to the epipolar geometry is at most 4 pixels and its rays meet in front
+        of both cameras. The number is 0 if the model lacks one of the photographs.
+        """
         cameras, pixels = {}, {}
         for number in set(model.reg_image_ids()) & set(self.keypoints):
             image = model.image(number)
@@ -72,22 +74,22 @@ class VerifiedPairs:
         return agreeing
 
     def misplaced(self, model) -> list[int]:
-        """Numbers of the photographs whose poses in a model more than half of the matches with its other photographs
-        contradict."""
+        """Return the numbers of the photographs whose poses contradict more than half of their matches with other
+        photographs of the model."""
         inside = np.isin(self.pairs, list(model.reg_image_ids())).all(1)
         balance = np.where(inside, 2 * self.agreeing_matches(model) - self.counts, 0)
         return np.flatnonzero(np.bincount(self.pairs.ravel(), np.repeat(balance, 2)) < 0).tolist()
 
 
 def _meet_ahead(first: Camera, second: Camera, pixels_first: np.ndarray, pixels_second: np.ndarray) -> np.ndarray:
-    """(M,) whether the lines of sight of matched (M, 2) positions are nearest to each other before both cameras."""
+    """Return (M,) whether the rays of matched (M, 2) positions are closest to each other in front of both cameras."""
     rays = []
     for camera, pixels in ((first, pixels_first), (second, pixels_second)):
         local = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
         rays.append(np.column_stack([local, np.ones(len(local))]) @ camera.rotation)
     one, two = rays
     base = second.center - first.center
-    # Depths of the nearest points, times the square of the sine of the angle between the rays.
+    # Depths of the closest points, times the squared sine of the angle between the rays.
     across, along, along_two = (one * two).sum(1), one @ base, two @ base
     depth = (two * two).sum(1) * along - across * along_two
     depth_two = across * along - (one * one).sum(1) * along_two

@@ -1,4 +1,4 @@
-"""Views whose photographs are averaged down."""
+"""Views with reduced photographs."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class SmallCopy(View):
 
     @staticmethod
     def of(view: View, factor: int) -> SmallCopy:
-        """Means of `factor` by `factor` pixels; rows and columns that are left over are cut off."""
+        """Return a copy that averages `factor` by `factor` pixels; remaining rows and columns are cut off."""
         own = {entry.name: getattr(view, entry.name) for entry in fields(View)}
         return SmallCopy(**own | {"camera": smaller(view.camera, factor)}, original=view, factor=factor)
 
     @staticmethod
     def within(view: View, longer_side: int) -> SmallCopy:
-        """By the least factor with which the longer side has at most so many pixels."""
+        """Return a copy reduced by the smallest factor for which the longer side has at most `longer_side` pixels."""
         return SmallCopy.of(view, -(-max(view.camera.width, view.camera.height) // longer_side))
 
     def load(self) -> Photo:

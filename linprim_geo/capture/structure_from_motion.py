@@ -1,8 +1,7 @@
-"""Camera poses for photographs that come without: structure from motion by pycolmap on the CPU, kept in the cache
-folder.
+"""Camera poses for photographs without poses: structure from motion by pycolmap on the CPU, stored in the cache folder.
 
-Keypoints and matches are kept while they are made, so that a run that was stopped goes on where it was; the finished
-model stays.
+Keypoints and matches are stored while they are computed, so that an interrupted run continues where it stopped. They
+are removed at the end; the finished model is kept.
 """
 
 from __future__ import annotations
@@ -35,8 +34,9 @@ from linprim_geo.capture.load import has_poses
 from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.imaging import photos
 
-# Bytes of keypoints and matches in pycolmap's database, twice as many as a photograph has (4,096 keypoints of 150
-# bytes, and matches), as SQLite writes all of it a second time. On a full disk SQLite ends the process.
+# Disk space in bytes for pycolmap's database, in general and per photograph: twice the size of a photograph's data
+# (4,096 keypoints of 150 bytes, and matches), because SQLite writes everything a second time. SQLite ends the process
+# if the disk is full.
 ROOM, ROOM_PER_PHOTOGRAPH = 8 * 2**20, 2 * 2**20
 
 Refine = Callable[[Path, Path, Path, Callable[[str], None]], bool]
@@ -52,8 +52,8 @@ def prepare(
     refine: Refine | None = None,
     **changes: Any,
 ) -> None:
-    """Makes a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; leaves
-    all else alone.
+    """Make a folder of photographs without poses, or a video, readable by `load_scene`, which may take minutes; other
+    captures are left unchanged.
 
     Args:
         path, options, cache, changes: as for `load_scene`.
@@ -77,23 +77,23 @@ def find_poses(
     log: Callable[[str], None] | None = None,
     refine: Refine | None = None,
 ) -> Path:
-    """Finds the poses of the photographs in `root`, unless that was done before; returns the folder of the COLMAP
+    """Find the poses of the photographs in `root`, unless this was done before, and return the folder of the COLMAP
     model.
 
-    SIFT keypoints, matches of every pair (of more than 60 photographs: of those that look alike or follow each other),
-    incremental mapping with one radial distortion; photographs of one folder, size and focal length (EXIF) share a
-    camera. Of several models that do not connect the largest is kept. The result is kept in the cache folder under the
-    content of the photographs.
+    Detects SIFT keypoints, matches every pair (with more than 60 photographs, only similar or consecutive ones), and
+    runs incremental mapping with one radial distortion parameter. Photographs of the same folder, size and focal length
+    (EXIF) share a camera. If there are several unconnected models, the largest is kept. The result is stored in the
+    cache folder, keyed by the contents of the photographs.
 
     Args:
         cache: see `photos.cache_folder`.
         threads: 0 uses all cores.
-        log: is called with lines of progress and with the verdict.
-        refine: is called once for a model, with `root`, the model's folder, an empty one and `log`; returns whether it
-            has written a better model there, such as `stereo.refine_found_poses.refined_model`.
+        log: called with lines of progress and with the verdict.
+        refine: called once per model with `root`, the model's folder, an empty folder and `log`; returns whether it has
+            written a better model to the empty folder. Example: `stereo.refine_found_poses.refined_model`.
 
     Raises:
-        LinprimError: no photographs, one that cannot be read, or too few of them that get a pose.
+        LinprimError: no photographs, an unreadable one, or too few that get a pose.
     """
     say = log or (lambda line: None)
     folder, names = photographs(root)
@@ -123,7 +123,7 @@ def find_poses(
 
 
 def _refine(root: Path, kept: Path, verdict: Verdict, refine: Refine, say: Callable[[str], None]) -> None:
-    """Puts the refined model in the place of that in `kept`, if there is one, and notes that this was done."""
+    """Replace the model in `kept` by the refined one, if there is one, and record that refinement was done."""
     part, start = kept / "model.part", time.monotonic()
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
@@ -143,8 +143,8 @@ def _reconstruct(
     threads: int,
     say: Callable[[str], None],
 ) -> Verdict:
-    """Goes on with what is in `kept`, and leaves the largest model and the verdict there."""
-    database = kept / "database.db"  # of a run that was stopped
+    """Continue with the files in `kept`, and write the largest model and the verdict there."""
+    database = kept / "database.db"  # left by an interrupted run
     there = database.stat().st_size if database.exists() else 0
     check_room(kept, ROOM + ROOM_PER_PHOTOGRAPH * len(names) - there)
     try:

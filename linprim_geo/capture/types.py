@@ -1,4 +1,4 @@
-"""A capture in memory: photographs, views, points, and the scene they make."""
+"""Data types of a capture in memory: photographs, views, points, and the scene."""
 
 from __future__ import annotations
 
@@ -17,18 +17,17 @@ from linprim_geo.imaging.decoded_photos import DecodedPhotos
 if TYPE_CHECKING:
     from linprim_geo.capture.adjusted_poses import AdjustedPoses
 
-# `Scene.kind` of photographs whose poses were found by structure from motion.
+# `Scene.kind` of captures whose poses were found by structure from motion.
 PHOTOGRAPHS = "photographs"
-# Largest entry of R^T R - 1 that is still taken for rounding of the file's digits; such poses are made
-# orthonormal.
+# Largest entry of R^T R - 1 that is attributed to rounding in the file; such poses are made orthonormal.
 _RIGID_TOLERANCE = 5e-3
 
 
 @dataclass(frozen=True)
 class Photo:
-    """The decoded pixels of one view: `rgb` (H, W, 3) uint8 and, where there is one, `alpha` (H, W) uint8.
+    """Decoded pixels of one view: `rgb` (H, W, 3) uint8 and optionally `alpha` (H, W) uint8.
 
-    Where alpha is below 255 the colours are straight, not premultiplied.
+    Colours are not premultiplied by alpha.
     """
 
     rgb: np.ndarray
@@ -47,11 +46,10 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class View:
-    """One posed photograph. `camera` is a pinhole (already undistorted) of the size that `load` returns.
+    """One posed photograph. `camera` is an undistorted pinhole camera of the size that `load` returns.
 
-    The file itself may be larger (`downscale`) or distorted (`lens`); `file_size` is its (width, height),
-    None if it is the camera's. `has_alpha` says whether `load` returns an alpha channel: all views of a scene
-    do, or none.
+    The file may be larger (`downscale`) or distorted (`lens`); `file_size` is its (width, height), None if equal to the
+    camera's. `has_alpha` says whether `load` returns an alpha channel; it is the same for all views of a scene.
     """
 
     name: str
@@ -70,10 +68,10 @@ class View:
     decoded: DecodedPhotos | None = field(default=None, compare=False, repr=False)
 
     def load(self) -> Photo:
-        """The photograph at the camera's size; undistorted ones are kept in the cache folder, and what the capture has
-        room for stays in memory.
+        """Return the photograph at the camera's size. Undistorted ones are stored in the cache folder, and as many as
+        fit stay in memory.
 
-        A mask file replaces an alpha channel. Safe to call from several threads.
+        A mask file replaces the alpha channel. Thread-safe.
 
         Raises:
             LinprimError: a file is missing, damaged or of another size than at load time.
@@ -107,8 +105,8 @@ class View:
         return photos.box_downscale(rgb, alpha, self.downscale)
 
     def load_depth(self) -> np.ndarray | None:
-        """(H, W) float32 z-depth at the camera's pixel centres in the data set's unit, 0 = none; None without
-        a file.
+        """Return (H, W) float32 z-depths at the camera's pixel centres in the data set's unit, 0 = none; None without a
+        file.
 
         Raises:
             LinprimError: the file is missing, damaged, or not of the image's size.
@@ -121,11 +119,11 @@ class View:
         return photos.downscale_depth(depth, self.downscale)
 
     def load_normals(self) -> np.ndarray | None:
-        """(H, W, 3) float32 unit normals at the camera's pixel centres in its axes (x right, y down, z forward), 0 =
-        none; None without a file. `normal_frame` says what axes the file has: "world", "camera", or "camera_opengl" (x
-        right, y up, z back).
+        """Return (H, W, 3) float32 unit normals at the camera's pixel centres in camera axes (x right, y down, z
+        forward), 0 = none; None without a file.
 
-        Averaging down takes the normal of the pixel at, or just above and left of, the new centre.
+        `normal_frame` defines the axes of the file: "world", "camera", or "camera_opengl" (x right, y up, z back). When
+        downscaling, the normal of the pixel at, or just above and left of, the new centre is used.
 
         Raises:
             LinprimError: the file is missing, damaged, or not of the image's size.
@@ -148,15 +146,17 @@ class View:
         return self.file_size or (self.camera.width * self.downscale, self.camera.height * self.downscale)
 
     def _full_target(self) -> Intrinsics:
-        """The pinhole before averaging down, without the rows and columns that averaging crops."""
+        """Return the pinhole camera before averaging down, without the rows and columns that averaging crops."""
         c, k = self.camera, self.downscale
         return Intrinsics(c.width * k, c.height * k, c.fx * k, c.fy * k, c.cx * k, c.cy * k)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A capture in the data set's own frame and unit, split into training and held-out views; `adjusted` are the poses
-    that they have in place of the given ones, `downscale` the number of pixels a side that were averaged into one."""
+    """A capture in the data set's frame and unit, split into training and held-out views.
+
+    `adjusted`: poses that replace the given ones. `downscale`: number of pixels a side that were averaged into one.
+    """
 
     root: Path
     kind: str
@@ -169,23 +169,23 @@ class Scene:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """Training and held-out views, in this order."""
+        """Return training and held-out views, in this order."""
         return self.train + self.test
 
     @property
     def has_alpha(self) -> bool:
-        """Whether the views come with an alpha channel or a foreground mask."""
+        """Return whether the views come with an alpha channel or a foreground mask."""
         return any(view.has_alpha for view in self.views)
 
     def release_photos(self) -> None:
-        """Forgets the photographs that stay decoded."""
+        """Remove decoded photographs from memory."""
         for view in self.views:
             if view.decoded is not None:
                 view.decoded.clear()
 
     def with_training_views(self, count: int) -> Scene:
-        """The same with `count` of the training views, evenly spread over them; with all of them for 0, or where there
-        are fewer."""
+        """Return the scene with `count` of its training views, evenly spread; with all of them for 0 or if there are
+        fewer."""
         if not 0 < count < len(self.train):
             return self
         kept = np.linspace(0, len(self.train), count, endpoint=False).astype(int)
@@ -194,11 +194,10 @@ class Scene:
 
 @dataclass(frozen=True)
 class Frame:
-    """What a reader found out about one photograph; `where` names its place in the data set's file, for
-    messages.
+    """What a reader found about one photograph. `where` is its location in the data set's file, for messages.
 
-    `relative` is the image's path as the data set writes it; `split` is "test" for a held-out one, if that is
-    said.
+    `relative` is the image's path as written in the data set; `split` is "test" for a held-out photograph, if the data
+    set says so.
     """
 
     where: str
@@ -216,7 +215,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Listing:
-    """What a reader found in a folder, before images are looked at."""
+    """What a reader found in a folder, before images are opened."""
 
     kind: str
     frames: tuple[Frame, ...]
@@ -225,7 +224,7 @@ class Listing:
 
 
 def check_pose(matrix: np.ndarray, where: str) -> np.ndarray:
-    """The (4, 4) float64 rigid transform nearest to a (3, 4) or (4, 4) matrix that is one but for rounding.
+    """Return the (4, 4) float64 rigid transform nearest to a (3, 4) or (4, 4) matrix that is rigid up to rounding.
 
     Raises:
         LinprimError: not finite, mirrored, singular, or scaled.

@@ -1,4 +1,4 @@
-"""Photographs from a video: the sharpest frame of each of as many equal parts, through PyAV (the extra `video`)."""
+"""Photographs from a video: the sharpest frame of each of several equal parts, decoded by PyAV (the extra `video`)."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from linprim_geo.base.files import locked, readable_write_errors
 from linprim_geo.imaging import photos
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-# Changed whenever other frames are chosen, so that old cache entries are not found any more.
+# Raised whenever other frames are chosen, so that old cache entries are not used any more.
 _CACHE_VERSION = 2
 _JPEG_QUALITY = 95
 _READ_BYTES = 1 << 22
 
 
 def is_video(path: Path) -> bool:
-    """Whether this is a file with the suffix of a video."""
+    """Return whether this is a file with the suffix of a video."""
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
 def frames_folder(video: Path, count: int, cache: Path | None = None) -> Path:
-    """Where `extract_frames` leaves the frames of a video: in the cache folder, under its content and their number."""
+    """Return the folder in which `extract_frames` stores the frames of a video: in the cache folder, keyed by the
+    video's content and their number."""
     digest = hashlib.blake2b(repr((_CACHE_VERSION, count)).encode(), digest_size=16)
     try:
         with open(video, "rb") as file:
@@ -41,10 +42,10 @@ def frames_folder(video: Path, count: int, cache: Path | None = None) -> Path:
 def extract_frames(
     video: Path, count: int, cache: Path | None = None, log: Callable[[str], None] | None = None
 ) -> Path:
-    """Writes `count` frames, or all there are, as JPEG files unless that was done before; returns their folder.
+    """Write `count` frames, or all if there are fewer, as JPEG files unless that was done before; return their folder.
 
-    Of each of `count` equal parts the frame is taken whose grey values have the largest variance of their Laplacian.
-    Frames of a phone that was held upright are turned as the video says.
+    From each of `count` equal parts, the frame with the largest variance of the Laplacian of its grey values is taken.
+    Frames of a phone held upright are rotated as the video's metadata says.
 
     Raises:
         LinprimError: PyAV is not installed, the file holds no video that can be decoded, or the frames cannot be
@@ -62,7 +63,7 @@ def extract_frames(
 
 
 def _extract(av, video: Path, count: int, folder: Path, say: Callable[[str], None]) -> None:
-    """Makes the folder, complete at once."""
+    """Create the folder with all frames atomically."""
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir()
@@ -83,7 +84,7 @@ def _extract(av, video: Path, count: int, folder: Path, say: Callable[[str], Non
 
 
 def _save_sharpest(av, video: Path, count: int, folder: Path) -> tuple[int, int]:
-    """Saves the frames; returns how many, and how many the video has."""
+    """Save the frames; return their number and the number of frames in the video."""
     total, kept, interval = _count(av, video), 0, 0
     best: tuple[float, int, np.ndarray] | None = None
     with av.open(str(video)) as container:
@@ -113,20 +114,20 @@ def _pyav():
 
 
 def _count(av, video: Path) -> int:
-    """Frames in the first video stream: as the file says, else counted."""
+    """Return the number of frames in the first video stream: as stated in the file, else counted."""
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         return stream.frames or max(1, sum(1 for packet in container.demux(stream) if packet.size))
 
 
 def _upright(frame) -> np.ndarray:
-    """(H, W, 3) uint8 colours of a frame as a player shows it: turned by quarters and mirrored as its display matrix
-    says."""
+    """Return the (H, W, 3) uint8 colours of a frame as a player shows it: rotated by quarter turns and mirrored
+    according to its display matrix."""
     image = frame.to_ndarray(format="rgb24")
     side_data = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:
         return image
-    # (x, y) is shown at (a x + c y, b x + d y), in numbers of 16.16 bits.
+    # (x, y) is shown at (a x + c y, b x + d y), in 16.16 fixed-point numbers.
     (a, b), (c, d) = np.frombuffer(bytes(side_data), "=i4").reshape(3, 3)[:2, :2].astype(float)
     if abs(b) + abs(c) > abs(a) + abs(d):
         image, a, d = image.transpose(1, 0, 2), c, b

@@ -1,1 +1,1 @@
-"""One module per data format that a capture may come in."""
+"""Readers: one module per data format of a capture."""

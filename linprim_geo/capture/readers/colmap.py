@@ -1,7 +1,7 @@
-"""Reading COLMAP models, binary or text, through pycolmap, after checking that the files are whole.
+"""Read COLMAP models, binary or text, with pycolmap, after checking that the files are complete.
 
-pycolmap takes some truncated files without a word and answers others with an allocation failure, so sizes and
-counts are compared first.
+pycolmap accepts some truncated files silently and fails with an allocation error on others, so sizes and counts are
+checked first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from linprim_geo.geometry.lens import Lens, check_lens, model_parameter_counts
 _MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 _IMAGE_FOLDERS = ("images", "image", "input", "rgb", ".")
 _TABLES = ("cameras", "images", "points3D")
-# How deep below a scene's folder models are looked for that nobody named.
+# Depth below a scene's folder to which models are searched for if none is given.
 _SEARCH_DEPTH = 3
 
 
@@ -35,7 +35,7 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A model as far as it is used here; `points` is None if there are none."""
+    """The parts of a model that are used here; `points` is None if there are none."""
 
     folder: Path
     images: tuple[PosedImage, ...]
@@ -43,7 +43,7 @@ class ColmapModel:
 
 
 def find_model(root: Path, sparse: Path | None = None) -> Path | None:
-    """The folder of the model to read: `sparse` (or `sparse/0`) if given, else the first of the usual places.
+    """Return the folder of the model to read: `sparse` (or `sparse/0`) if given, else the first of the usual places.
 
     Raises:
         LinprimError: `sparse` is given and holds no model.
@@ -60,12 +60,12 @@ def find_model(root: Path, sparse: Path | None = None) -> Path | None:
 
 
 def has_model(folder: Path) -> bool:
-    """Whether the folder has a model's table of cameras."""
+    """Return whether the folder has a model's table of cameras."""
     return _has_table(folder, "cameras")
 
 
 def models_below(root: Path) -> list[Path]:
-    """Every folder of a complete model up to three levels below `root`, the usual places first."""
+    """Return every folder with a complete model up to three levels below `root`, the usual places first."""
     found = [root / name for name in _MODEL_FOLDERS]
     for depth in range(1, _SEARCH_DEPTH + 1):
         for pattern in ("/".join(["*"] * depth + ["cameras.bin"]), "/".join(["*"] * depth + ["cameras.txt"])):
@@ -75,8 +75,8 @@ def models_below(root: Path) -> list[Path]:
 
 
 def read_colmap(root: Path, model: Path, images: Path | None = None) -> Listing:
-    """The listing of a capture whose cameras come from `model` and whose images lie in `images`, or in one of the usual
-    folders of `root`.
+    """Return the listing of a capture with cameras from `model` and images in `images`, or in one of the usual folders
+    of `root`.
 
     Raises:
         LinprimError: the model is damaged or empty, or registered images are not on disk.
@@ -106,10 +106,10 @@ def read_colmap(root: Path, model: Path, images: Path | None = None) -> Listing:
 
 
 def read_model(folder: Path) -> ColmapModel:
-    """Reads a model of any age (with or without rigs), binary if both kinds are there.
+    """Read a model of any version (with or without rigs); binary if both kinds exist.
 
     Raises:
-        LinprimError: a file is missing or cut short, a camera model is unknown, a pose or camera holds NaN.
+        LinprimError: a file is missing or truncated, a camera model is unknown, a pose or camera holds NaN.
     """
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
@@ -155,7 +155,7 @@ def _has_table(folder: Path, table: str) -> bool:
 
 
 def _check_files(folder: Path) -> str:
-    """Refuses a model with a file missing or cut short; returns the suffix of the kind to read."""
+    """Raise LinprimError for a model with a missing or truncated file; return the suffix of the files to read."""
     for suffix in (".bin", ".txt"):
         there = [table for table in _TABLES if (folder / f"{table}{suffix}").is_file()]
         if len(there) == len(_TABLES):
@@ -181,7 +181,7 @@ def _check_files(folder: Path) -> str:
 
 
 def _check_binary(file: Path, table: str) -> None:
-    """Walks the records of a binary table; its end must be the end of the file."""
+    """Step through the records of a binary table; they must end at the end of the file."""
     data = file.read_bytes()
     walk = {
         "cameras": _walk_camera,
@@ -233,7 +233,7 @@ def _walk_rig(data: bytes, offset: int, file: Path) -> int:
     offset += 8
     for index in range(sensors):
         offset += 8
-        if index > 0:  # all but the reference say whether they have a pose in the rig, and which
+        if index > 0:  # all sensors but the reference store whether they have a pose in the rig, and the pose
             offset += 1 + (56 if data[offset] else 0)
     return offset
 
@@ -244,7 +244,7 @@ def _walk_frame(data: bytes, offset: int, file: Path) -> int:
 
 
 def _check_text(file: Path, table: str) -> None:
-    """Compares the number of lines with the header's, and the number of words with what a line needs."""
+    """Check the number of lines against the header, and the number of words against what each line needs."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError as error:

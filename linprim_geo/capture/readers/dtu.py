@@ -1,4 +1,4 @@
-"""Reading DTU scans as IDR and NeuS prepared them: `cameras_sphere.npz` beside folders of images and masks."""
+"""Read DTU scans as prepared by IDR and NeuS: `cameras_sphere.npz` beside folders of images and masks."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from linprim_geo.imaging import photos
 _CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 _IMAGE_FOLDERS = ("image", "images", "rgb")
 _MASK_FOLDERS = ("mask", "masks")
-# The pinhole has no skew; one that moves no pixel of the image by this many is rounding of the projection matrix.
+# The pinhole model has no skew. A skew that shifts every pixel by at most this much is rounding of the projection
+# matrix.
 _MAX_SKEW_PX = 0.5
-# How far from the image's middle, in shares of its size, a principal point may lie.
+# Largest distance of a principal point from the image's centre, as a share of its size.
 _MAX_OFF_CENTRE = 0.25
 
 
 def find_cameras(root: Path) -> Path | None:
-    """The file of cameras in the folder, if there is one."""
+    """Return the file of cameras in the folder, or None."""
     return next((root / name for name in _CAMERAS if (root / name).is_file()), None)
 
 
 def read_dtu(root: Path, cameras: Path) -> Listing:
-    """Reads `world_mat_i @ scale_mat_i`, which projects from the unit sphere's frame, of every image, sorted by name.
+    """Read `world_mat_i @ scale_mat_i`, which projects from the unit sphere's frame, for every image, sorted by name.
 
-    Photographs smaller than those of the matrices by a whole factor are noticed by the principal point and their
-    cameras scaled. Pixel centres of the matrices are at whole numbers, so half a pixel is added.
+    Photographs that are smaller than the matrices imply by a whole factor are recognised by the principal point, and
+    their cameras are scaled. Pixel centres of the matrices are at whole numbers, so half a pixel is added.
 
     Raises:
-        LinprimError: a damaged file, a missing matrix, another number of images or masks, or a matrix that is no
+        LinprimError: a damaged file, a missing matrix, another number of images or masks, or a matrix that is not a
             camera.
     """
     folder = next((root / name for name in _IMAGE_FOLDERS if photos.files_in(root / name)), None)
@@ -63,8 +64,8 @@ def read_dtu(root: Path, cameras: Path) -> Listing:
 
 
 def decomposed(projection: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """(3, 3) calibration with a positive diagonal and last entry 1, and (4, 4) world-to-camera pose, of a (3, 4)
-    projection matrix.
+    """Decompose a (3, 4) projection matrix into the (3, 3) intrinsics, with a positive diagonal and last entry 1, and
+    the (4, 4) world-to-camera pose.
 
     Raises:
         LinprimError: not finite, or without an inverse.

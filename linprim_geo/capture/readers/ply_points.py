@@ -1,4 +1,4 @@
-"""Reading the vertices of a PLY file as a point cloud, ASCII or binary, refusing one that is cut short."""
+"""Read the vertices of a PLY file, ASCII or binary, as a point cloud; truncated files are rejected."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ _GREY = 128
 
 
 def read_points_ply(path: Path) -> PointCloud | None:
-    """Positions and colours (`red green blue`, 8-bit or float in [0, 1]; grey if there are none) of the
-    vertices.
+    """Return the positions and colours of the vertices (`red green blue`, 8-bit or float in [0, 1]; grey if there are
+    none).
 
     Points that are not finite are left out; None if none is left.
 
     Raises:
-        LinprimError: not a PLY file, no x y z, or fewer vertices than the header promises.
+        LinprimError: not a PLY file, no x y z, or fewer vertices than the header states.
     """
     header = read_ply_header(path)
     vertex = header.element("vertex")

@@ -1,5 +1,5 @@
-"""Reading RGB-D sequences, in metres: Redwood's and Open3D's (`trajectory.log`, a folder of colour and one of depth)
-and TUM's (`rgb.txt`, `depth.txt`, `groundtruth.txt`)."""
+"""Read RGB-D sequences, in metres: Redwood's and Open3D's (`trajectory.log`, a folder of colour and one of depth) and
+TUM's (`rgb.txt`, `depth.txt`, `groundtruth.txt`)."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from linprim_geo.imaging import photos
 _COLOR_FOLDERS = ("image", "color", "rgb", "images")
 _LOGS = ("trajectory.log", "scene/trajectory.log")
 _INTRINSICS = ("camera_intrinsic.json", "intrinsic.json", "intrinsics.json", "camera_primesense.json")
-# The PrimeSense that Redwood and TUM recorded with, where no file says otherwise: 319.5, 239.5 with pixel centres at
-# whole numbers.
+# Intrinsics of the PrimeSense camera with which Redwood and TUM recorded, used if no file gives others: 319.5, 239.5 if
+# pixel centres are at whole numbers.
 _PRIMESENSE = Lens("PINHOLE", 640, 480, (525.0, 525.0, 320.0, 240.0))
-# Metres per step of a depth map.
+# Metres per integer unit of a depth map.
 _METRES_REDWOOD, _METRES_TUM = 1e-3, 1 / 5000
-# Seconds between a photograph and the depth map and pose that belong to it, at most.
+# Largest difference in seconds between a photograph and its depth map or pose.
 _MAX_SECONDS = 0.02
 
 
 def find_tum(root: Path) -> bool:
-    """Whether the folder has TUM's lists."""
+    """Return whether the folder has TUM's lists."""
     return (root / "rgb.txt").is_file() and (root / "groundtruth.txt").is_file()
 
 
 def find_log(root: Path) -> Path | None:
-    """The trajectory of a folder that also has depth maps."""
+    """Return the trajectory in a folder that also has depth maps, or None."""
     if not (root / "depth").is_dir():
         return None
     logs = [root / name for name in _LOGS if (root / name).is_file()] + sorted(
@@ -42,10 +42,10 @@ def find_log(root: Path) -> Path | None:
 
 
 def read_tum(root: Path) -> Listing:
-    """Every photograph with a pose at most 0.02 s away, and the depth map that is as near, if there is one.
+    """Return every photograph with a pose at most 0.02 s away, and its depth map if one is as close.
 
     Raises:
-        LinprimError: a list that cannot be read, files that are not on disk, or no photograph with a pose.
+        LinprimError: an unreadable list, files that are not on disk, or no photograph with a pose.
     """
     seconds, names = trajectories.read_tum_list(root / "rgb.txt")
     times, poses = trajectories.read_tum_poses(root / "groundtruth.txt")
@@ -72,12 +72,12 @@ def read_tum(root: Path) -> Listing:
 
 
 def read_log(root: Path, log: Path) -> Listing:
-    """Every photograph that `log` has a pose of, with the depth map of its name, or of its place in the order if there
-    are as many.
+    """Return every photograph for which `log` has a pose, with the depth map of the same name, or of the same position
+    in order if there are equally many.
 
     Raises:
-        LinprimError: a trajectory that cannot be read, no photographs, or numbers of poses, photographs and depth maps
-            that do not fit.
+        LinprimError: an unreadable trajectory, no photographs, or inconsistent numbers of poses, photographs and depth
+            maps.
     """
     folder = next((root / name for name in _COLOR_FOLDERS if photos.files_in(root / name)), None)
     if folder is None:
@@ -103,7 +103,7 @@ def read_log(root: Path, log: Path) -> Listing:
 
 
 def _pinhole(root: Path) -> tuple[Lens, str]:
-    """The pinhole of a sequence, from a file or the PrimeSense's, and who says so."""
+    """Return the pinhole intrinsics of a sequence, from a file or the PrimeSense's, and the source for messages."""
     file = next((root / name for name in _INTRINSICS if (root / name).is_file()), None)
     if file is not None:
         return read_intrinsics(file), f"{file} says"
@@ -119,11 +119,13 @@ def _check_size(image: Path, where: str, lens: Lens, said: str) -> None:
 
 
 def read_intrinsics(path: Path) -> Lens:
-    """The pinhole of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers column by column. Pixel
-    centres are at whole numbers there, so half a pixel is added to the principal point.
+    """Read the pinhole intrinsics of Open3D's JSON: `width`, `height` and `intrinsic_matrix`, nine numbers in
+    column-major order.
+
+    Pixel centres are at whole numbers there, so half a pixel is added to the principal point.
 
     Raises:
-        LinprimError: unreadable, or not a pinhole.
+        LinprimError: unreadable, or not a pinhole camera.
     """
     values = read_json(path, "a camera's intrinsics")
     try:

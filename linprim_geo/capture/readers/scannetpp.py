@@ -1,7 +1,6 @@
-"""Reading ScanNet++ scenes, `dslr` or `iphone`, in the frame of `scans/mesh_aligned_0.05.ply` and in metres.
+"""Read ScanNet++ scenes, `dslr` or `iphone`, in the frame of `scans/mesh_aligned_0.05.ply` and in metres.
 
-The masks of anonymised pixels say what was blurred, not what is empty, so they are no foreground masks and are not
-used.
+The masks of anonymised pixels mark what was blurred, not background, so they are not used.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ _TRANSFORMS, _TRANSFORMS_UNDISTORTED = "nerfstudio/transforms.json", "nerfstudio
 
 
 def find_device(root: Path) -> Path | None:
-    """The folder of one camera's images and poses: `dslr` or `iphone` in the scene's folder, or that folder itself."""
+    """Return the folder of one camera's images and poses: `dslr` or `iphone` in the scene's folder, or that folder
+    itself."""
     folders = [root / name for name in _DEVICES]
     if root.resolve().name in _DEVICES or any((root / name).is_dir() for name in (_DISTORTED[0], *_UNDISTORTED)):
         folders.append(root)
@@ -36,14 +36,14 @@ def find_device(root: Path) -> Path | None:
 
 
 def read_scannetpp(device: Path) -> Listing:
-    """Reads the images as they were taken (fisheye) if they are there, else the undistorted ones.
+    """Read the original (fisheye) images if they exist, else the undistorted ones.
 
-    Poses and points are those of `colmap`; without it poses are those of `nerfstudio`, turned back. Held out is what
-    `train_test_lists.json` calls test; of those, images that are not on disk are left out, as the benchmark keeps some.
-    Images that `nerfstudio` marks `is_bad` (blurred, most of them) are left out of both.
+    Poses and points come from `colmap`; without it, poses come from `nerfstudio`, transformed back. Images that
+    `train_test_lists.json` lists as test are held out; those of them that are not on disk are left out, because the
+    benchmark withholds some. Images that `nerfstudio` marks `is_bad` (mostly blurred) are left out of both.
 
     Raises:
-        LinprimError: a file that is missing or damaged, or training images that are not on disk.
+        LinprimError: a missing or damaged file, or training images that are not on disk.
     """
     distorted = next((device / name for name in _DISTORTED if (device / name).is_dir()), None)
     images = distorted or device / _UNDISTORTED[0]
@@ -88,8 +88,8 @@ def _split(held_out: set[str], test: bool) -> str | None:
 
 
 def _of_transforms(path: Path, images: Path) -> tuple[dict[str, Lens], dict[str, np.ndarray]]:
-    """The cameras of a nerfstudio file whose paths are names in `images`, in the frame of the mesh: `applied_transform`
-    undone."""
+    """Return the cameras of a nerfstudio file whose paths are names in `images`, in the frame of the mesh, with
+    `applied_transform` undone."""
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted the cameras of {images}")
     frames, applied = read_transforms.read_cameras(path, images)
@@ -101,7 +101,7 @@ def _of_transforms(path: Path, images: Path) -> tuple[dict[str, Lens], dict[str,
 
 
 def _bad(transforms: Path) -> set[str]:
-    """Names of the images that are of no use, where there is a file that says so."""
+    """Return the names of images marked as bad, if there is a file that marks them."""
     if not transforms.is_file():
         return set()
     return {Path(name.replace("\\", "/")).name for name in read_transforms.bad_frames(transforms)}

@@ -1,4 +1,4 @@
-"""Reading Tanks and Temples by its `NAME_COLMAP_SfM.log`, which has poses but no intrinsics: these come from a file
+"""Read Tanks and Temples captures from `NAME_COLMAP_SfM.log`, which has poses but no intrinsics; these come from a file
 beside it."""
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ _INTRINSICS = ("intrinsics.json", "intrinsic.json", "camera_intrinsic.json")
 
 
 def find_log(root: Path) -> Path | None:
-    """The trajectory in a scene's folder, if there is one."""
+    """Return the trajectory in a scene's folder, or None."""
     logs = sorted(root.glob("*_COLMAP_SfM.log")) or sorted(filter(trajectories.is_log, root.glob("*.log")))
     return next((log for log in logs if _images(root, log)), None)
 
 
 def read_tnt(root: Path, log: Path) -> Listing:
-    """Every photograph that the trajectory has a pose of.
+    """Return every photograph for which the trajectory has a pose.
 
     Raises:
-        LinprimError: no intrinsics, a trajectory that cannot be read, or poses that do not fit the photographs.
+        LinprimError: no intrinsics, an unreadable trajectory, or poses that do not fit the photographs.
     """
     images = _images(root, log)
     file = next((root / name for name in _INTRINSICS if (root / name).is_file()), None)
@@ -51,6 +51,6 @@ def read_tnt(root: Path, log: Path) -> Listing:
 
 
 def _images(root: Path, log: Path) -> list[Path]:
-    """In `images`, in a folder of the scene's name, or beside the trajectory."""
+    """Return the photographs in `images`, in a folder with the scene's name, or beside the trajectory."""
     name = log.name.removesuffix("_COLMAP_SfM.log")
     return next((found for folder in ("images", "image", name, ".") if (found := photos.files_in(root / folder))), [])

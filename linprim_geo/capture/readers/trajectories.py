@@ -1,4 +1,4 @@
-"""Camera trajectories as text: the `.log` of Redwood, Open3D and Tanks and Temples, and the lists of TUM's RGB-D
+"""Read camera trajectories as text: the `.log` of Redwood, Open3D and Tanks and Temples, and the lists of TUM's RGB-D
 benchmark."""
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import check_pose
 
-# A quaternion's length differs from 1 by rounding alone, which the files do to four digits.
+# Largest deviation of a quaternion's length from 1, which comes from rounding to four digits in the files.
 _UNIT_TOLERANCE = 0.01
 
 
 def is_log(path: Path) -> bool:
-    """Whether a file begins as a `.log` of poses does, with a line of three whole numbers; others have that suffix
-    too."""
+    """Return whether a file begins like a `.log` of poses, with a line of three whole numbers; other files have that
+    suffix too."""
     try:
         with open(path, encoding="utf-8") as file:
             words = file.readline(200).split()
@@ -27,13 +27,13 @@ def is_log(path: Path) -> bool:
 
 
 def read_log(path: Path) -> list[tuple[int, np.ndarray]]:
-    """(number, (4, 4) camera-to-world) of each frame of a `.log`: a line of three whole numbers, then a matrix in four
-    lines.
+    """Return (number, (4, 4) camera-to-world) of each frame of a `.log`: a line of three whole numbers, then a matrix
+    in four lines.
 
     Frames whose second number is -1 have no pose and are left out.
 
     Raises:
-        LinprimError: unreadable, empty, a frame that is cut short, or a matrix that is no pose.
+        LinprimError: unreadable, empty, a truncated frame, or a matrix that is not a pose.
     """
     rows = _rows(path)
     if len(rows) % 5:
@@ -58,8 +58,11 @@ def read_log(path: Path) -> list[tuple[int, np.ndarray]]:
 
 
 def log_by_image(frames: list[tuple[int, np.ndarray]], images: list[Path], path: Path) -> list[tuple[Path, np.ndarray]]:
-    """Gives frames of a `.log` their photographs: in order where there are as many; where there are more photographs,
-    the one of the frame's number, counted from 0; where there are fewer, each the frame of the number that is its name.
+    """Assign photographs to the frames of a `.log`.
+
+    If there are equally many, they are assigned in order. If there are more photographs, a frame gets the photograph
+    with the frame's number, counted from 0. If there are fewer, each photograph gets the frame whose number is its
+    name.
 
     Raises:
         LinprimError: numbers and photographs do not fit together.
@@ -84,11 +87,11 @@ def log_by_image(frames: list[tuple[int, np.ndarray]], images: list[Path], path:
 
 
 def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """(F,) seconds, sorted, and (F, 4, 4) camera-to-world of lines `timestamp tx ty tz qx qy qz qw`.
+    """Return (F,) timestamps in seconds, sorted, and (F, 4, 4) camera-to-world matrices of lines `timestamp tx ty tz qx
+    qy qz qw`.
 
     Raises:
-        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion that is far from unit
-            length.
+        LinprimError: unreadable, empty, not eight finite numbers in a line, or a quaternion far from unit length.
     """
     from scipy.spatial.transform import Rotation
 
@@ -112,10 +115,10 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_tum_list(path: Path) -> tuple[np.ndarray, list[str]]:
-    """(F,) seconds, sorted, and the file names of lines `timestamp name`.
+    """Return (F,) timestamps in seconds, sorted, and the file names of lines `timestamp name`.
 
     Raises:
-        LinprimError: unreadable, empty, or a line that is something else.
+        LinprimError: unreadable, empty, or a line of another form.
     """
     table = []
     for number, row in enumerate(_rows(path), start=1):
@@ -130,8 +133,8 @@ def read_tum_list(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def nearest(seconds: np.ndarray, wanted: np.ndarray, within: float) -> np.ndarray:
-    """(W,) index into the sorted (F,) `seconds` of the one nearest to each `wanted`, -1 where none is `within` so many
-    seconds."""
+    """Return, for each of (W,) `wanted` times, the index of the nearest of the sorted (F,) `seconds`, or -1 if none is
+    at most `within` seconds away."""
     after = np.clip(np.searchsorted(seconds, wanted), 0, len(seconds) - 1)
     before = np.maximum(after - 1, 0)
     index = np.where(np.abs(seconds[before] - wanted) <= np.abs(seconds[after] - wanted), before, after)
@@ -139,7 +142,7 @@ def nearest(seconds: np.ndarray, wanted: np.ndarray, within: float) -> np.ndarra
 
 
 def _rows(path: Path) -> list[list[str]]:
-    """The words of every line that is neither empty nor a comment."""
+    """Return the words of every line that is neither empty nor a comment."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except OSError as error:

@@ -1,8 +1,7 @@
-"""Reading `transforms*.json`: NeRF-synthetic, nerfstudio and instant-ngp captures, and the points that belong
-to them.
+"""Read `transforms*.json` of NeRF-synthetic, nerfstudio and instant-ngp captures, and the points that belong to them.
 
-Their camera-to-world matrices have OpenGL axes (x right, y up, z backward); their pixel centres are at +0.5. Poses and
-`ply_file_path` are taken to be in one frame, as they are written; points of a COLMAP model are brought into it by
+Camera-to-world matrices have OpenGL axes (x right, y up, z backward); pixel centres are at +0.5. Poses and
+`ply_file_path` are assumed to be in the same frame, as written. Points of a COLMAP model are transformed to it by
 `applied_transform` and `applied_scale`.
 """
 
@@ -22,9 +21,9 @@ from linprim_geo.capture.types import Frame, Listing, PointCloud, check_pose
 from linprim_geo.geometry.lens import Lens
 from linprim_geo.imaging import photos
 
-# Suffixes tried for a `file_path` without one, in this order.
+# Suffixes tried, in this order, for a `file_path` without one.
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff")
-# Metres per unit of a depth map of integers whose file does not say: millimetres, as nerfstudio takes them.
+# Metres per unit of an integer depth map without a stated scale: millimetres, as in nerfstudio.
 _DEFAULT_DEPTH_UNIT = 1e-3
 _FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
 _PERSPECTIVE_MODELS = (
@@ -37,22 +36,22 @@ _PERSPECTIVE_MODELS = (
     "RADIAL",
     "FULL_OPENCV",
 )
-# A COLMAP model belongs to the transforms if its cameras are where theirs are, up to this share of their
-# spread ...
+# A COLMAP model belongs to the transforms if its camera positions agree with theirs up to this share of their spread
+# ...
 _AGREE_POSITION = 0.01
-# ... and turned by no more than this many degrees.
+# ... and their rotations up to this many degrees.
 _AGREE_DEGREES = 1.0
-# Numbers beyond this are no lengths or pixels, and their squares overflow.
+# Larger numbers cannot be lengths or pixels, and their squares overflow.
 LARGEST = 1e30
 _NORMAL_FRAMES = ("world", "camera", "camera_opengl")
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def is_there(root: Path) -> bool:
-    """Whether the folder has transforms that `read_transforms` looks for.
+    """Return whether the folder has transforms that `read_transforms` reads.
 
     Raises:
-        LinprimError: one of them is a link to nothing, which is not what a folder of plain photographs has.
+        LinprimError: one of them is a broken link, which a folder of plain photographs would not have.
     """
     for name in ("transforms_train.json", "transforms.json"):
         if (root / name).is_symlink() and not (root / name).exists():
@@ -61,8 +60,7 @@ def is_there(root: Path) -> bool:
 
 
 def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | None = None) -> Listing:
-    """Reads `json_file`, else `transforms_train.json` with `_test` (or, without one, `_val`), else
-    `transforms.json`.
+    """Read `json_file`, else `transforms_train.json` with `_test` (or, if missing, `_val`), else `transforms.json`.
 
     Raises:
         LinprimError: broken JSON, a missing key, an image that is not on disk, an unknown camera model.
@@ -85,7 +83,7 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
         files = [(root / "transforms.json", None)]
     frames, headers = [], []
     for path, split in files:
-        # A file of held-out views that names none says that there are none.
+        # An empty file of held-out views means that there are none.
         header = _read_json(path, may_be_empty=split == "test")
         headers.append((path, header))
         frames.extend(_read_frames(path, header, split))
@@ -98,10 +96,10 @@ def read_transforms(root: Path, json_file: Path | None = None, sparse: Path | No
 
 
 def read_cameras(path: Path, images: Path) -> tuple[list[Frame], np.ndarray | None]:
-    """The frames of one file whose paths are names in the folder `images`, without side files, and its (3, 4)
-    `applied_transform`.
+    """Return the frames of one file whose paths are names in the folder `images`, without mask, depth and normal files,
+    and its (3, 4) `applied_transform`.
 
-    Frames whose image is not on disk are there too, those that are marked `is_bad` are not.
+    Frames whose image is not on disk are included; those marked `is_bad` are not.
 
     Raises:
         LinprimError: broken JSON, a missing key, an unknown camera model.
@@ -134,7 +132,7 @@ def _read_json(path: Path, may_be_empty: bool = False) -> dict:
 
 
 def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
-    """The frames of one file, with images found on disk and cameras checked for numbers."""
+    """Return the frames of one file, after finding the images on disk and checking the cameras' numbers."""
     entries = header["frames"] + header["test_frames"]
     held_out = set(map(id, header["test_frames"]))
     located, missing = [], []
@@ -162,14 +160,14 @@ def _read_frames(path: Path, header: dict, split: str | None) -> list[Frame]:
 
 
 def _checked(where: str, entry: object) -> str:
-    """Refuses an entry without a path; returns its place with the path, for messages."""
+    """Raise LinprimError for an entry without a path; return its location with the path, for messages."""
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
         raise LinprimError(f"{where}: no 'file_path', wanted the path of its image")
     return f"{where} ({entry['file_path']})"
 
 
 def _is_bad(entry: dict, where: str) -> bool:
-    """Whether the data set advises against the frame (nerfstudio's and ScanNet++'s mark of blurred ones)."""
+    """Return whether the data set marks the frame as bad (nerfstudio's and ScanNet++'s mark for blurred ones)."""
     bad = entry.get("is_bad", False)
     if not isinstance(bad, bool):
         raise LinprimError(f"{where}: 'is_bad' is {bad!r:.40}, wanted true or false")
@@ -177,7 +175,7 @@ def _is_bad(entry: dict, where: str) -> bool:
 
 
 def bad_frames(path: Path) -> set[str]:
-    """The `file_path`s that one file marks `is_bad`.
+    """Return the `file_path`s that one file marks `is_bad`.
 
     Raises:
         LinprimError: broken JSON, or entries without a path.
@@ -199,7 +197,7 @@ def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, spl
         found = "missing" if matrix is None else "not a table of 4x4 numbers"
         raise LinprimError(f"{where}: 'transform_matrix' is {found}, wanted the 4x4 camera-to-world matrix")
     depth = _side_file(folder, entry, "depth_file_path", where)
-    # Nothing but the file itself can say what axes its normals have.
+    # The axes of the normals are known only if the file states them.
     axes = values.get("normal_frame")
     if axes not in (None, *_NORMAL_FRAMES):
         raise LinprimError(f"{where}: 'normal_frame' is {axes!r}, wanted one of {', '.join(_NORMAL_FRAMES)}")
@@ -219,7 +217,7 @@ def _frame(folder: Path, header: dict, entry: dict, where: str, image: Path, spl
 
 
 def _world_to_camera(camera_to_world: np.ndarray, where: str) -> np.ndarray:
-    """Checks the pose as it is written, then turns axes and direction."""
+    """Check the pose as written, then convert its axes and invert it."""
     pose = check_pose(camera_to_world, where) @ _OPENGL_TO_OPENCV
     rotation = pose[:3, :3].T
     out = np.eye(4)
@@ -275,8 +273,7 @@ def _number(values: dict, key: str, where: str, default: float | None = None) ->
 
 
 def _lens(values: dict, where: str, image: Path) -> Lens:
-    """The camera model of one frame; what the file does not say is derived from the image's size and the
-    view angle."""
+    """Return the camera model of one frame. Missing values are derived from the image's size and the angle of view."""
     if values.get("w") is None or values.get("h") is None:
         width, height, _ = photos.image_header(image)
     else:
@@ -322,8 +319,8 @@ def _focal(values: dict, key: str, angle_key: str, size: int, where: str) -> flo
 
 
 def _named_splits(path: Path, header: dict, file_paths: list[str]) -> list[str | None]:
-    """nerfstudio's `train_filenames`, `test_filenames` and `val_filenames`; val counts if there is no
-    test."""
+    """Return each image's split by nerfstudio's `train_filenames`, `test_filenames` and `val_filenames`; val is used if
+    there is no test."""
     lists = {key: header.get(f"{key}_filenames") for key in ("train", "test", "val")}
     held_out = lists["test"] or lists["val"]
     if not held_out:
@@ -335,8 +332,8 @@ def _named_splits(path: Path, header: dict, file_paths: list[str]) -> list[str |
 
 
 def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None) -> PointCloud | None:
-    """`--sparse` as it is asked for; else the named PLY; else the best of the models in the folder that
-    agree."""
+    """Return the points of `--sparse` if given, else those of the named PLY file, else those of the best agreeing model
+    in the folder."""
     applied = _applied_transform(headers)
     if sparse is not None:
         model = read_colmap.find_model(root, sparse)
@@ -359,15 +356,15 @@ def _points(root: Path, headers: list, frames: list[Frame], sparse: Path | None)
         try:
             cloud, difference = _model_points(model, frames, applied)
         except LinprimError:
-            continue  # not asked for: a damaged model that only might have helped stops nobody
+            continue  # not requested by the user, so a damaged model is skipped
         if cloud is not None and difference <= 1:
             found.append((difference, len(found), cloud))
     return min(found)[2] if found else None
 
 
 def _applied_transform(headers: list) -> np.ndarray | None:
-    """nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, `applied_scale` times
-    `applied_transform`; None where neither is given."""
+    """Return nerfstudio's (3, 4) matrix from COLMAP's world to that of the transforms, `applied_scale` times
+    `applied_transform`; None if neither is given."""
     for path, header in headers:
         if header.get("applied_transform") is not None or header.get("applied_scale") is not None:
             given = header.get("applied_transform")
@@ -385,7 +382,7 @@ def _applied_transform(headers: list) -> np.ndarray | None:
 
 
 def _model_points(model: Path, frames: Iterable[Frame], applied: np.ndarray | None) -> tuple[PointCloud | None, float]:
-    """The model's points in the frame of the transforms, and how far its cameras are off (1: just
+    """Return the model's points in the frame of the transforms, and how far its cameras deviate (1: just
     acceptable)."""
     colmap = read_colmap.read_model(model)
     theirs = {Path(pose.name).stem: pose.world_to_camera for pose in colmap.images}
@@ -410,8 +407,8 @@ def _model_points(model: Path, frames: Iterable[Frame], applied: np.ndarray | No
 
 
 def _pose_difference(pairs: list, matrix: np.ndarray, offset: np.ndarray) -> float:
-    """Worst of the differences in position and angle, as multiples of what is allowed, when `matrix`, a rotation that
-    may scale, and `offset` have moved the first of each pair."""
+    """Return the largest difference in position or angle, as a multiple of the allowed one, after the first pose of
+    each pair was moved by `matrix`, a rotation that may scale, and `offset`."""
     theirs = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose, _ in pairs]) @ matrix.T + offset
     ours = np.array([-pose[:3, :3].T @ pose[:3, 3] for _, pose in pairs])
     spread = np.linalg.norm(ours - ours.mean(axis=0), axis=1).max()
