@@ -1,1 +1,1 @@
-"""The folder of a training, and rendering from it."""
+"""Run folders: the results of a training, and rendering from them."""

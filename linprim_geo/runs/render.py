@@ -1,4 +1,4 @@
-"""Rendering a run's views to files: colour, depths, normals and opacity as floats, each with a preview to look at."""
+"""Render a run's views to files: colour, depths, normals and opacity as floats, each with a preview image."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ def render_run(
     output: str | os.PathLike | None = None,
     quiet: bool = False,
 ) -> dict:
-    """Renders the views of a split to `output` (default RUN/renders).
+    """Render the views of a split to `output` (default RUN/renders).
 
     Writes SPLIT/rgb/NAME.png, and for depth_median, depth_expected, depth_first, opacity (H, W) and normal (H, W, 3;
-    world axes) NAME.npy as float32 beside a NAME.png to look at. Depths are z-depths in the data set's unit, 0 where
-    there is none.
+    world axes) NAME.npy as float32 and a preview NAME.png. Depths are z-depths in the data set's unit, 0 where there is
+    none.
 
     Returns: `output`, `views`, `files`.
     """

@@ -1,13 +1,13 @@
-"""A run's folder: what a training leaves behind, and rendering from it.
+"""A run's folder: the results of a training, and rendering from them.
 
 config.json       scene, options, versions: how the run was made
 transform.json    training frame <-> data-set frame, unit
-run.json          what the last save holds: iteration, primitives, background
+run.json          state of the last save: iteration, primitives, background
 training_frame.npz   primitives in the training frame, bit for bit as trained
-scene.npz, scene.ply the same in the data set's frame, ours and in LinPrim's format (Gaussians: 3DGS's)
-environment.npy, .png  cube map of what stands behind everything, if it was trained, and a picture of it (`environment`)
+scene.npz, scene.ply the same in the data set's frame, in our format and in LinPrim's (Gaussians: 3DGS's)
+environment.npy, .png  cube map of the environment at infinity, if it was trained, and a panorama of it (`environment`)
 found_poses/      COLMAP model of photographs that came without poses
-adjusted_poses.json  those that took the place of the capture's, if its photographs called for it
+adjusted_poses.json  poses that replace the capture's, if bundle adjustment changed them
 metrics.jsonl     loss, PSNR, ... over time                        checkpoints/step_*.pt, latest
 """
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
     from linprim_geo.geometry.primitives import Tensors
 
 
-# Folder of the COLMAP model of a run on photographs whose poses were found.
+# Folder of the COLMAP model of a run whose poses were found by structure from motion.
 FOUND_POSES = "found_poses"
 ADJUSTED_POSES = "adjusted_poses.json"
 
 
 @dataclass(frozen=True)
 class Run:
-    """An opened run folder. Everything it hands out is in the data set's frame and unit unless it says otherwise."""
+    """An opened run folder. All results are in the data set's frame and unit unless stated otherwise."""
 
     path: Path
     scene_path: Path
@@ -73,11 +73,12 @@ class Run:
         time_budget: dict | None = None,
         blocks: int | None = None,
     ) -> Run:
-        """Makes the folder and writes its configuration. `instruction_set` is noted because results depend on it in
-        their last bits, `effects`, what was decided about the scene (`effects.Decision`), to be read, `time_budget`, a
-        plan (`pacing.Pace`), and `blocks`, their number where it is trained in several (`block_training`).
+        """Create the folder and write its configuration.
 
-        config.json comes last: without it nothing has begun, see `is_unused`.
+        config.json also stores `instruction_set`, because results depend on it in their last bits; `effects`, the
+        decisions about the scene (`effects.Decision`); `time_budget`, a plan (`pacing.Pace`); and `blocks`, their
+        number if the scene is trained in several (`training.blocks`). It is written last: without it, the run has not
+        begun, see `is_unused`.
 
         Raises:
             LinprimError: the folder exists and is not empty, or cannot be written.
@@ -99,7 +100,7 @@ class Run:
             config["time_budget"] = time_budget
         if blocks is not None:
             config["blocks"] = blocks
-        # The cache may be emptied, and poses that are found anew would lie in another frame.
+        # Copied, because the cache may be emptied, and poses found again would be in another frame.
         if scene.kind == PHOTOGRAPHS and (model := found_model(scene.root)) is not None:
             with readable_write_errors(path / FOUND_POSES):
                 shutil.copytree(model, path / FOUND_POSES, dirs_exist_ok=True)
@@ -119,7 +120,7 @@ class Run:
 
     @staticmethod
     def open(path: str | os.PathLike) -> Run:
-        """Opens an existing run.
+        """Open an existing run.
 
         Raises:
             LinprimError: not a run folder, or a file in it is damaged.
@@ -129,7 +130,7 @@ class Run:
         try:
             scale, offset = float(transform["scale"]), [float(x) for x in transform["offset"]]
             scene, unit = Path(config["scene"]), str(transform["unit"])
-            scene.exists()  # raises for what no path can be
+            scene.exists()  # raises for an invalid path
             saved = config["scene_options"], config["train_options"]
         except (KeyError, TypeError, ValueError, OverflowError, OSError) as error:
             raise LinprimError(f"{path}: config.json or transform.json lacks what a run needs ({error})") from None
@@ -142,10 +143,10 @@ class Run:
         return Run(path, scene, from_saved(SceneOptions, saved[0], where), options, similarity, unit)
 
     def with_scene_at(self, scene_path: Path) -> Run:
-        """The same run with its capture at another place, written down as well; for data that was moved.
+        """Return the same run with its capture at another path, and store that path; for data that was moved.
 
         Raises:
-            LinprimError: the capture is still where it was, so this would be another one.
+            LinprimError: the capture is still at its old path, so the other one is a different capture.
         """
         if self.scene_path.exists():
             raise LinprimError(f"{self.path}: was trained on {self.scene_path}, not on {scene_path.resolve()}")
@@ -155,24 +156,24 @@ class Run:
 
     @property
     def notes(self) -> dict:
-        """Contents of config.json."""
+        """Return the contents of config.json."""
         return _read_json(self.path / "config.json", self.path)
 
     def note(self, name: str, value: object) -> None:
-        """Writes an entry of config.json beside the options."""
+        """Write an additional entry to config.json."""
         write_json(self.path / "config.json", self.notes | {name: value})
 
     @cached_property
     def instruction_set(self) -> str:
-        """Vector kernels it was begun with, "" if that was not noted."""
+        """Return the vector kernels with which the run was begun, "" if not recorded."""
         return str(_read_json(self.path / "config.json", self.path).get("instruction_set", ""))
 
     def scene(self) -> Scene:
-        """The capture it was trained on."""
+        """Return the capture that the run was trained on."""
         return self._scene
 
     def with_held_out_views(self) -> Run:
-        """The same run, with its held-out views among those of training."""
+        """Return the same run with its held-out views added to the training views."""
         other, scene = replace(self), self.scene()
         other.__dict__["_scene"] = replace(scene, train=scene.views, test=())
         return other
@@ -187,7 +188,7 @@ class Run:
 
     @cached_property
     def state(self) -> dict:
-        """Contents of run.json: `iteration`, `primitives`, `background`, `seconds`."""
+        """Return the contents of run.json: `iteration`, `primitives`, `background`, `seconds`."""
         state = _read_json(self.path / "run.json", self.path)
         color = state.get("background")
         if (
@@ -204,11 +205,11 @@ class Run:
 
     @property
     def background(self) -> np.ndarray:
-        """(3,) float64 colour in [0, 1] behind everything."""
+        """Return the (3,) float64 background colour in [0, 1]."""
         return np.asarray(self.state["background"], dtype=np.float64)
 
     def save(self, primitives: Primitives, state: dict, environment: torch.Tensor | None = None) -> None:
-        """Replaces the saved primitives (training frame), the environment if there is one, and run.json, each
+        """Replace the saved primitives (training frame), the environment map if there is one, and run.json, each
         atomically."""
         from linprim_geo.geometry.environment_map import save_environment
         from linprim_geo.geometry.primitive_files import write_primitive_ply
@@ -221,20 +222,20 @@ class Run:
         save_primitives(self.path / "scene.npz", exported)
         write_primitive_ply(self.path / "scene.ply", exported)
         write_json(self.path / "run.json", state)
-        for name in ("state", "environment", "_trained"):  # read anew
+        for name in ("state", "environment", "_trained"):  # drop cached values, so that they are read again
             self.__dict__.pop(name, None)
 
     @cached_property
     def environment(self) -> torch.Tensor | None:
-        """(6, S, S, 3) cube map of what stands at infinity behind everything, see `ops.environment_light`; None without
-        one. Its axes are those of the data set."""
+        """Return the (6, S, S, 3) environment map at infinity, see `ops.environment_light`; None without one. Its axes
+        are those of the data set."""
         from linprim_geo.geometry.environment_map import load_environment
 
         return load_environment(self.path)
 
     def training_primitives(self) -> Primitives:
-        """The saved primitives in the training frame, bit for bit as trained. Not to be changed: the file is read
-        once."""
+        """Return the saved primitives in the training frame, bit for bit as trained. Do not modify them: the file is
+        read only once."""
         return self._trained
 
     @cached_property
@@ -242,18 +243,18 @@ class Run:
         return load_primitives(self.path / "training_frame.npz")
 
     def primitives(self) -> Primitives:
-        """The saved primitives in the data set's frame."""
+        """Return the saved primitives in the data set's frame."""
         return to_data_set(self.training_primitives(), self.similarity)
 
     def render_views(
         self, views: Iterable[View], geometry: bool = True, level: float = 0.5
     ) -> Iterator[tuple[View, dict[str, np.ndarray]]]:
-        """Renders views over the run's background, one at a time.
+        """Render views over the run's background, one at a time.
 
         Yields: (view, images) with float32 `rgb` (3, H, W), `opacity` (H, W) and, with `geometry`, the z-depths
-            `depth_median` (at transmittance `level`), `depth_first`, `depth_expected` (mean of what is there, divided
-            by the opacity), each (H, W) in the data set's unit with 0 where there is none, and `normal` (H, W, 3), the
-            entry normal at the median depth in world axes.
+        `depth_median` (at transmittance `level`), `depth_first`, `depth_expected` (weighted mean, divided by the
+        opacity), each (H, W) in the data set's unit with 0 where there is none, and `normal` (H, W, 3), the entry
+        normal at the median depth in world axes.
         """
         import torch
 
@@ -288,12 +289,14 @@ class Run:
             yield view, images
 
     def surface_depths(self, views: Iterable[View], level: float) -> Iterator[tuple[View, np.ndarray, np.ndarray]]:
-        """Where the transmittance of every ray falls to `level`, overlaps counted exactly (`ops.level_depth`).
+        """Compute depth maps at which the transmittance of every ray falls to `level`, with exact overlap
+        (`ops.level_depth`).
 
-        A Gaussian has no inside, so theirs is the median depth of `ops.rasterize`: the centre at which the
-        transmittance jumps over `level`. No screen filter: it would thicken what the surface is made from.
+        Gaussians have no inside, so for them it is the median depth of `ops.rasterize`: the centre at which the
+        transmittance crosses `level`. No screen filter is applied, because it would thicken the surface.
 
-        Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where it never does.
+        Yields: (view, depth, opacity), each (H, W) float32; z-depth in the data set's unit, 0 where `level` is never
+        reached.
         """
         import torch
 
@@ -313,7 +316,8 @@ class Run:
             yield view, (depth.numpy() / self.similarity.scale).astype(np.float32), opacity.float().numpy()
 
     def raster_arguments(self) -> tuple[Tensors, torch.Tensor, dict]:
-        """What `ops.rasterize` takes: tensors, background, keywords. Before an environment the background is black."""
+        """Return the arguments of `ops.rasterize`: tensors, background, keywords. The background is black if there is
+        an environment map."""
         import torch
 
         primitives = self.training_primitives()
@@ -325,8 +329,8 @@ class Run:
 
 
 def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:
-    """Primitives of the training frame in the data set's: lengths divided by the scale, densities multiplied by it; the
-    opacity of Gaussians stays."""
+    """Convert primitives from the training frame to the data set's: lengths are divided by the scale, densities
+    multiplied by it; the opacity of Gaussians is unchanged."""
     solid = KINDS[primitives.kind].solid
     return replace(
         primitives,
@@ -337,8 +341,8 @@ def to_data_set(primitives: Primitives, similarity: Similarity) -> Primitives:
 
 
 def is_unused(path: Path) -> bool:
-    """Whether a run can be made at `path`: nothing is there, or no more than a run leaves that was killed before it
-    began."""
+    """Return whether a run can be created at `path`: there is nothing, or only the leftovers of a run that was killed
+    before it began."""
     if not path.exists():
         return True
     return path.is_dir() and all(
@@ -347,7 +351,7 @@ def is_unused(path: Path) -> bool:
 
 
 def refuse_used(path: Path) -> None:
-    """Raises LinprimError where something is in the way of a new run."""
+    """Raise LinprimError if a new run cannot be created at `path`."""
     if not is_unused(path):
         how = ", or go on with --resume" if (path / "config.json").is_file() else ""
         raise LinprimError(f"{path}: exists already; give another folder with -o{how}")
