@@ -91,7 +91,7 @@ def _setup_terms(photos: float, pixels: float) -> tuple[float, float, float]:
 
 
 def _filling_terms(photos: float) -> tuple[float, float]:
-    from linprim_geo.points.densify import MOST_VIEWS
+    from linprim_geo.points.fill_gaps import MOST_VIEWS
 
     return 1.0, min(float(photos), MOST_VIEWS)
 
@@ -205,7 +205,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
 
     from linprim_geo.capture.load import load_scene
     from linprim_geo.kernels import ops
-    from linprim_geo.points.densify import densify
+    from linprim_geo.points.fill_gaps import fill_gaps
     from linprim_geo.points.initial_points import scene_normalization
     from linprim_geo.runs.run import Run
     from linprim_geo.training.blocks.windows import Windows
@@ -218,7 +218,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     how = TrainOptions(max_primitives=primitives, initial_primitives=primitives, threads=1)
     similarity = scene_normalization(loaded)
     before = time.process_time()
-    cloud = densify(loaded, how.seed)
+    cloud = fill_gaps(loaded, how.seed)
     filling = time.process_time() - before
     windows, images = Windows(), []
     for view in loaded.train:

@@ -116,7 +116,7 @@ def load_scene(
     return scene.with_training_views(options.views)
 
 
-def told_downscale(scene: Scene, options: SceneOptions, log: Callable[[str], None]) -> int:
+def resolved_downscale(scene: Scene, options: SceneOptions, log: Callable[[str], None]) -> int:
     """Return the `downscale` with which a scene was read. If `options` left it open and it is not 1, report it to
     `log`."""
     if options.downscale == "auto" and scene.downscale > 1:

@@ -19,15 +19,15 @@ _FOCUS_ROUNDS = 5
 
 
 def read_box(text: str, cameras: Sequence[Camera] = ()) -> np.ndarray | None:
-    """Return the (2, 3) lower and upper corners for "x0,y0,z0,x1,y1,z1", `looked_at` for "auto", or None for "".
+    """Return the (2, 3) lower and upper corners for "x0,y0,z0,x1,y1,z1", `focus_box` for "auto", or None for "".
 
     Raises:
-        LinprimError: anything else, a corner that is not below the other, or what `looked_at` raises.
+        LinprimError: anything else, a corner that is not below the other, or what `focus_box` raises.
     """
     if not text:
         return None
     if text == "auto":
-        return looked_at(cameras)
+        return focus_box(cameras)
     try:
         corners = np.array([float(word) for word in text.split(",")])
     except ValueError:
@@ -45,7 +45,7 @@ def as_text(corners: np.ndarray) -> str:
     return ",".join(f"{value:.17g}" for value in corners.ravel())
 
 
-def looked_at(cameras: Sequence[Camera]) -> np.ndarray:
+def focus_box(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the (2, 3) corners of the cube around the `focus_point` of the cameras.
 
     Its half side is the distance from the centre of the image to the nearer border at that depth, median over the

@@ -10,8 +10,8 @@ import numpy as np
 from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import PointCloud, Scene
-from linprim_geo.points.densify import densify
 from linprim_geo.points.far_colors import FarColors
+from linprim_geo.points.fill_gaps import fill_gaps
 from linprim_geo.points.initial_points import (
     VolumePoints,
     frusta_points,
@@ -22,7 +22,7 @@ from linprim_geo.points.initial_points import (
 SFM_START, RANDOM_START = 0.8, 0.25
 # If fewer points than this are triangulated, too much of the scene is empty and random points are added.
 FEW_POINTS = 500
-# Number of stereo points by which gaps are found. `densify` fills about 1,400 image cells per view, so a sample is
+# Number of stereo points by which gaps are found. `fill_gaps` fills about 1,400 image cells per view, so a sample is
 # enough.
 FILLED_BY = 4000
 
@@ -70,17 +70,17 @@ def filled_points(
     far: FarColors | None = None,
     surfaces: PointCloud | None = None,
 ) -> PointCloud:
-    """Return the scene's points and those on `surfaces`, with gaps filled by `densify`. Random points in a volume lie
+    """Return the scene's points and those on `surfaces`, with gaps filled by `fill_gaps`. Random points in a volume lie
     on no surface and are returned unchanged."""
     assert scene.points is not None
     if isinstance(scene.points, VolumePoints):
         return scene.points
     if surfaces is None:
-        return densify(scene, seed, backdrop, far)
+        return fill_gaps(scene, seed, backdrop, far)
     # A sample of the stereo points is enough to show where points are missing.
     step = max(1, len(surfaces.xyz) // FILLED_BY)
     few = _joined(scene.points, PointCloud(surfaces.xyz[::step], surfaces.rgb[::step]))
-    filled = densify(replace(scene, points=few), seed, backdrop, far)
+    filled = fill_gaps(replace(scene, points=few), seed, backdrop, far)
     added = PointCloud(filled.xyz[len(few.xyz) :], filled.rgb[len(few.xyz) :])
     return _joined(_joined(scene.points, surfaces), added)
 

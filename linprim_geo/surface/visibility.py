@@ -110,7 +110,7 @@ def faces_of_pixels(caster: MeshViews, cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def pixels_of(photo: Photo) -> np.ndarray:
-    """Return (H, W, 3) uint8 of a photograph, or with alpha (H, W, 4), as `photographed` takes images."""
+    """Return (H, W, 3) uint8 of a photograph, or with alpha (H, W, 4), as `sample_photographs` takes images."""
     return photo.rgb if photo.alpha is None else np.dstack([photo.rgb, photo.alpha])
 
 
@@ -145,11 +145,11 @@ def color_vertices(
     normals = vertex_normals(mesh) if mesh.normals is None else mesh.normals
     edge = mesh.vertices[mesh.faces[:, 1]] - mesh.vertices[mesh.faces[:, 0]]
     slack = float(np.median(np.linalg.norm(edge, axis=1)))
-    colors, good, seen = photographed(caster, mesh.vertices, normals, cameras, images, slack)
+    colors, good, seen = sample_photographs(caster, mesh.vertices, normals, cameras, images, slack)
     return _fill_unseen(mesh, colors, good, seen)
 
 
-def photographed(
+def sample_photographs(
     caster: MeshViews,
     points: np.ndarray,
     normals: np.ndarray,

@@ -17,7 +17,7 @@ from linprim_geo.surface.postprocess import finish_surface, with_rounds
 
 # Voxel sizes of the coarse passes, and the finest that is chosen, as multiples of the one that the views support. Half
 # of that one has 2 % more Chamfer distance and 17 times the open edges on the built-in part, for four times the time.
-COARSE, FINEST = (4.0, 2.0), 1.0
+PASS_MULTIPLES, FINEST = (4.0, 2.0), 1.0
 # Voxel size, as a multiple, of a first pass with the cheapest options, which loads libraries and is not counted.
 WARM_UP = 8.0
 # Time that is kept from stereo, in times of that first pass. With stereo a pass takes three times as long, as two
@@ -93,14 +93,14 @@ def choose_voxel(run, options, target, stages, budget: Budget):
         options = replace(options, stereo=options.stereo if stereo else "off")
     supported = auto_voxel_size(kept["frames"])
     passes: list[tuple[float, float]] = []
-    for multiple in COARSE:
+    for multiple in PASS_MULTIPLES:
         voxel = multiple * supported
         if passes and budget.left() < (passes[0][0] / voxel) ** 2 * passes[0][1]:
             break  # a second pass might leave no time for the surface itself
         try:
             seconds = _timed_pass(run, replace(options, voxel_size=voxel), kept, target)
         except LinprimError:  # too coarse for a surface
-            if multiple == COARSE[-1]:
+            if multiple == PASS_MULTIPLES[-1]:
                 raise
             continue
         passes.append((voxel, seconds))

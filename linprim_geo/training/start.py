@@ -20,7 +20,7 @@ from linprim_geo.base.options import (
     flag_of,
 )
 from linprim_geo.base.progress import Progress
-from linprim_geo.capture.load import load_scene, settled_folders, told_downscale
+from linprim_geo.capture.load import load_scene, resolved_downscale, settled_folders
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.environment_map import texels_for
 from linprim_geo.imaging.decoded_photos import DecodedPhotos
@@ -65,7 +65,7 @@ def decided_scene(
 
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = read(scene_options)
-    scene_options = replace(scene_options, downscale=told_downscale(scene, scene_options, log))
+    scene_options = replace(scene_options, downscale=resolved_downscale(scene, scene_options, log))
     if choice.mode == "none" and not choice.asked:
         return [], scene, scene_options, options
     decisions = decide(scene, scene_options, options, choice)

@@ -280,7 +280,10 @@ def test_what_was_averaged_down_is_told_if_nobody_asked_for_it(tmp_path, monkeyp
     monkeypatch.setattr(load, "LONGEST_SIDE", 16)
     for options, told in ((SceneOptions(), 1), (SceneOptions(downscale=2), 0), (SceneOptions(downscale=1), 0)):
         lines: list[str] = []
-        assert load.told_downscale(load_scene(tmp_path, options), options, lines.append) == (options.downscale != 1) + 1
+        assert (
+            load.resolved_downscale(load_scene(tmp_path, options), options, lines.append)
+            == (options.downscale != 1) + 1
+        )
         assert len(lines) == told and all("2 by 2, to 16x12" in line and "--downscale 1" in line for line in lines)
 
 

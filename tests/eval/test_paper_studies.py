@@ -24,7 +24,7 @@ from linprim_geo.runs.run import Run
 @pytest.fixture(autouse=True)
 def points_as_they_are(monkeypatch):
     """Looking for more points takes seconds for every training."""
-    monkeypatch.setattr("linprim_geo.points.start_points.densify", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
 # --- classes ---------------------------------------------------------------------------------------------

@@ -226,7 +226,7 @@ def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
 
 def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
-        "linprim_geo.points.start_points.densify", lambda scene, *_: scene.points
+        "linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points
     )  # seconds for every model
     command = ["--quick", "-o", str(tmp_path), "--iterations", "50"]
     paper_tables.main(command)

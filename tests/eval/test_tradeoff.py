@@ -147,7 +147,7 @@ def shortened(monkeypatch, name, *values):
 def test_training_parameters_run_on_every_value(tiny_scene, tmp_path, monkeypatch):
     """A few steps each; how runs are scored is tested by the ones that score."""
     monkeypatch.setattr(
-        "linprim_geo.points.start_points.densify", lambda scene, *_: scene.points
+        "linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points
     )  # seconds for every value
     scored = []
 

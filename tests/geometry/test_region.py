@@ -7,7 +7,7 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.geometry.region import as_text, inside, looked_at, read_box
+from linprim_geo.geometry.region import as_text, focus_box, inside, read_box
 
 
 def around(place, distance=3.0, count=12):
@@ -20,13 +20,13 @@ def around(place, distance=3.0, count=12):
 
 def test_the_box_of_cameras_around_a_place_is_what_they_show_of_it():
     place = (5.0, -2.0, 1.0)
-    box = looked_at(around(place))
+    box = focus_box(around(place))
     # 15 pixels from the middle to the border, at a depth of 3.
     reach = 3.0 * 15 / 35
     np.testing.assert_allclose(box, [np.subtract(place, reach), np.add(place, reach)], atol=1e-9)
     # One that looks elsewhere does not take it far away.
     other = [*around(place, count=24), look_at((9.0, 0.0, 1.0), target=(9.0, 5.0, 1.0), size=(40, 30), focal=35.0)]
-    assert np.abs(looked_at(other) - box).max() < 0.3
+    assert np.abs(focus_box(other) - box).max() < 0.3
 
 
 def test_cameras_that_look_at_no_one_place_are_refused():
@@ -39,7 +39,7 @@ def test_cameras_that_look_at_no_one_place_are_refused():
         (along[:1], "1 cameras are known"),
     ):
         with pytest.raises(LinprimError, match=f"--box auto: .*{sentence}"):
-            looked_at(cameras)
+            focus_box(cameras)
 
 
 def test_corners_are_read_and_written():

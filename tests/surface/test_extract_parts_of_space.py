@@ -11,7 +11,7 @@ from conftest import CENTER
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.options import ExtractOptions
 from linprim_geo.geometry.mesh_files import load_mesh
-from linprim_geo.geometry.region import looked_at, read_box
+from linprim_geo.geometry.region import focus_box, read_box
 from linprim_geo.runs.run import Run
 from linprim_geo.surface import postprocess
 from linprim_geo.surface.extract import extract_mesh
@@ -48,7 +48,7 @@ def test_less_is_fused_within_a_box(solid, tmp_path, capsys):
 
 def test_auto_is_what_the_cameras_look_at(solid, tmp_path):
     stats = extract_mesh(solid, output=tmp_path / "mesh.ply", options=replace(OPTIONS, box="auto"), quiet=True)
-    wanted = looked_at([view.camera for view in Run.open(solid).scene().train])
+    wanted = focus_box([view.camera for view in Run.open(solid).scene().train])
     np.testing.assert_array_equal(read_box(stats["options"]["box"]), wanted)
     assert np.abs(wanted.mean(0) - CENTER).max() < 0.3
 

@@ -62,7 +62,7 @@ def scenes(tmp_path_factory):
 @pytest.fixture
 def own_points(monkeypatch):
     """Trainings start from the scene's points alone: looking for more is slow, and no matter of effects."""
-    monkeypatch.setattr("linprim_geo.points.start_points.densify", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
 def decisions(scene, choice=None, options=OPTIONS, scene_options=None):

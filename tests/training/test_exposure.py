@@ -42,7 +42,7 @@ def drifting(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def own_points(monkeypatch):
     """Trainings start from the scene's points alone: looking for more is slow, and no matter of exposure."""
-    monkeypatch.setattr("linprim_geo.points.start_points.densify", lambda scene, *_: scene.points)
+    monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
 def true_gains(scene):

@@ -19,7 +19,7 @@ from linprim_geo.base.files import is_leftover, locked, read_json, write_json
 from linprim_geo.base.options import SceneOptions, StereoOptions, TrainOptions, check, from_saved
 from linprim_geo.base.progress import Progress, Stages
 from linprim_geo.base.version import __version__
-from linprim_geo.capture.load import load_scene, told_downscale
+from linprim_geo.capture.load import load_scene, resolved_downscale
 from linprim_geo.capture.types import Scene, View
 from linprim_geo.kernels import ops
 from linprim_geo.points.start_points import with_points
@@ -140,7 +140,7 @@ def _photographs(
     """Return the photographs to process, and the notes about them."""
     prepare(path, scene_options, threads=options.threads, log=log)
     scene = load_scene(path, scene_options)
-    scene_options = replace(scene_options, downscale=told_downscale(scene, scene_options, log))
+    scene_options = replace(scene_options, downscale=resolved_downscale(scene, scene_options, log))
     if scene_options.poses == "auto":
         scene = adjusted_scene(scene, options.seed, threads=options.threads, log=log)
 

@@ -45,7 +45,7 @@ mask of only 0 and 255 has no such pixels."""
 SAMPLES = 3
 """Rays along each side of a pixel with which the mesh's coverage of the pixel is sampled."""
 
-BEFORE = 1.5
+DEPTH_CHECK_INSET = 1.5
 """Pixels inside of an outline at which the depth of the mesh is checked. It may differ from that of the vertex by what
 a sphere as large as the mesh's diagonal falls off there; if it differs by more, the outline is that of something else
 in front or behind."""
@@ -66,7 +66,7 @@ def moved_to_outlines(mesh: Mesh, views: Sequence[View]) -> Mesh:
     """
     if len(mesh.faces) == 0 or not views or views[0].load().alpha is None:  # all views have masks, or none has
         return mesh
-    views = [view for view in views if _tells_shares(view)]
+    views = [view for view in views if _has_coverage_mask(view)]
     if not views:
         return mesh
     for _ in range(ROUNDS):
@@ -74,7 +74,7 @@ def moved_to_outlines(mesh: Mesh, views: Sequence[View]) -> Mesh:
     return mesh
 
 
-def _tells_shares(view: View) -> bool:
+def _has_coverage_mask(view: View) -> bool:
     """Return whether a view has a mask whose pixels hold coverage, see PARTLY."""
     if (alpha := view.load().alpha) is None:
         return False
@@ -105,7 +105,7 @@ def _moves(mesh: Mesh, views: Sequence[View]) -> np.ndarray:
         front = faces_of[rows] @ (normals @ camera.center > heights).astype(np.int32)
         rows = rows[(front > 0) & (front < np.diff(faces_of.indptr)[rows])]
         footprint = depth[rows] / camera.fx
-        fall = np.sqrt(caster.diagonal * BEFORE * footprint)
+        fall = np.sqrt(caster.diagonal * DEPTH_CHECK_INSET * footprint)
         told, across, ahead = _outlines_ahead(_shares(view), covered, depths, pixels[rows], depth[rows], fall)
         rows, across = rows[told], np.append(across, np.zeros((len(across), 1)), axis=1) @ camera.rotation
         towards = vertices[rows] - camera.center
@@ -166,7 +166,7 @@ def _outlines_ahead(
     profile = sample_bilinear(np.stack([shares, covered], axis=-1), there).astype(np.float64)
     mask, mesh = profile[..., 0], profile[..., 1]
     own = STEP * mesh.sum(1) - REACH
-    behind = sample_nearest(depths, pixels[rows] - BEFORE * across)
+    behind = sample_nearest(depths, pixels[rows] - DEPTH_CHECK_INSET * across)
     fits = np.abs(behind - depth[rows]) < fall[rows]
     good = _ends(mask) & _ends(mesh) & (np.abs(own) <= NEAR) & fits
     told[rows[good]] = True

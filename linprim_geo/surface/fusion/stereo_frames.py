@@ -114,7 +114,7 @@ class MergedFrames(Sequence):
         backgrounds = far_parts(maps, no_walls, self._known(), rendered_depths, backgrounds)
         self.rendered = [_seen_past(*each) for each in zip(rendered, backgrounds, strict=True)]
         if not masked:
-            self._end_at(plain_walls)
+            self._clear_background(plain_walls)
         progress.stage(1, "gaps between planes")
         self.shown = [frame.depth[::SAMPLED, ::SAMPLED] > 0 for frame in self.rendered]
         known = self._known()
@@ -126,7 +126,7 @@ class MergedFrames(Sequence):
         self._enclose(walls, known, are_sharp, regions, backgrounds)
         # Depths that stereo has measured on enclosing planes, among their points, are not background where hardly any
         # view looks.
-        self._end_at(known_on_planes(self.cameras, planes, measured))
+        self._clear_background(known_on_planes(self.cameras, planes, measured))
         progress.stage(3, "thin things")
         self._keep_things(views, maps, rendered_depths, are_sharp)
         progress.stage(4, "backgrounds")
@@ -302,13 +302,13 @@ class MergedFrames(Sequence):
 
     def _end_backgrounds(self, maps: Sequence[DepthMap]) -> None:
         """Remove background at confirmed surfaces that no other view looks past, and at those with texture."""
-        self._end_at(lone_backgrounds(self.cameras, self._backgrounds(), self.depths))
-        self._end_at(textured_backgrounds(maps, self._backgrounds(), self.depths))
+        self._clear_background(lone_backgrounds(self.cameras, self._backgrounds(), self.depths))
+        self._clear_background(textured_backgrounds(maps, self._backgrounds(), self.depths))
 
     def _backgrounds(self) -> list[np.ndarray]:
         return [_background_of(frame) for frame in self.rendered]
 
-    def _end_at(self, surfaces: Sequence[np.ndarray]) -> None:
+    def _clear_background(self, surfaces: Sequence[np.ndarray]) -> None:
         """Remove these pixels (H, W) of every view from the background: their rays end at a surface."""
         self.rendered = [
             frame if frame.background is None else replace(frame, background=frame.background & ~surface)

@@ -184,8 +184,9 @@ class Grid:
         return np.flatnonzero(seen)
 
     def extract(self) -> Mesh:
-        """Return the surface in canonical order (`placed`); empty if the field never changes sign. Frees the field."""
-        return placed(self.surface(np.ones(len(self.blocks), bool)), self.origin)
+        """Return the surface in canonical order (`canonical_in_world`); empty if the field never changes sign. Frees
+        the field."""
+        return canonical_in_world(self.surface(np.ones(len(self.blocks), bool)), self.origin)
 
     def surface(self, owned: np.ndarray) -> Mesh:
         """Run marching cubes between voxels that any view has voted on, and return the part of the surface that belongs
@@ -214,7 +215,7 @@ class Grid:
         return Mesh(vertices * self.voxel, faces)
 
 
-def placed(surface: Mesh, origin: np.ndarray) -> Mesh:
+def canonical_in_world(surface: Mesh, origin: np.ndarray) -> Mesh:
     """Return surfaces of `Grid.surface`, one or several merged, in canonical order (`_canonical`) and in the frame of
     the cameras."""
     if len(surface.faces) == 0:

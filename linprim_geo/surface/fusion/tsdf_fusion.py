@@ -13,7 +13,7 @@ from linprim_geo.base.memory import available_memory
 from linprim_geo.geometry.mesh import Mesh, remove_small_components, select_faces
 from linprim_geo.surface.fusion.tsdf_field import BEHIND_VOXELS, DepthFrame, vote_rules
 from linprim_geo.surface.fusion.voxel_blocks import Lattice, TooFine, estimate_memory, find_blocks
-from linprim_geo.surface.fusion.voxel_levels import COARSE, VoxelLevels
+from linprim_geo.surface.fusion.voxel_levels import COARSE_RATIO, VoxelLevels
 from linprim_geo.surface.normals import vertex_normals
 
 MOST_FACES, CELLS_PER_AREA, AREA_CELLS = 1e6, 1.5, 64
@@ -35,7 +35,7 @@ def fuse_tsdf(
     occluded_vote: float = 0.0,
     log: Callable[[str], None] | None = None,
     fuse: Callable[[Lattice, Iterable[DepthFrame]], Mesh] | None = None,
-    counts: Callable[[Mesh], Mesh] | None = None,
+    relevant_part: Callable[[Mesh], Mesh] | None = None,
 ) -> Mesh:
     """Fuse depth maps into a triangle mesh with normals.
 
@@ -59,8 +59,8 @@ def fuse_tsdf(
             the truncation; 0.01 to 0.02 closes tunnels that too deep pixels dig into solids.
         log: called with lines such as the memory that will be taken.
         fuse: makes the surface of a grid in place of `fuse_lattice`; then `memory_limit` is not applied here.
-        counts: if given, voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones where it
-            bends, see `voxel_levels`. Returns the part of the coarse surface that counts for the choice.
+        relevant_part: if given, voxels have several sizes: twice `voxel_size` where the surface is flat, smaller ones
+            where it bends, see `voxel_levels`. Returns the part of the coarse surface that counts for the choice.
 
     Returns:
         The mesh in the frame of the cameras.
@@ -79,7 +79,7 @@ def fuse_tsdf(
 
     allowed, make = limit if fuse is None else np.inf, fuse or fuse_lattice
 
-    first_size = voxel_size if counts is None else COARSE * voxel_size
+    first_size = voxel_size if relevant_part is None else COARSE_RATIO * voxel_size
     try:
         found = find_blocks(frames, first_size, truncation_voxels, bounds, block_resolution, allowed)
     except TooFine as error:
@@ -89,11 +89,11 @@ def fuse_tsdf(
     levels = np.zeros(len(blocks), dtype=np.int64)
     lattice = Lattice(blocks, levels, levels, origin, first_size, block_resolution, truncation_voxels, rules)
     surface = make(lattice, frames)
-    if counts is not None:
-        coarse, sizes = surface, VoxelLevels(lattice, counts(surface), frames, MOST_FACES, allowed)
+    if relevant_part is not None:
+        coarse, sizes = surface, VoxelLevels(lattice, relevant_part(surface), frames, MOST_FACES, allowed)
         if sizes.lattice is not lattice:
             surface = make(sizes.lattice, frames)
-            if sizes.mend(coarse, surface):
+            if sizes.coarsen_torn_blocks(coarse, surface):
                 surface = make(sizes.lattice, frames)
             lattice = sizes.lattice
     need, voxels = estimate_memory(len(lattice.blocks), block_resolution, largest), lattice.voxel_sizes()

@@ -24,7 +24,7 @@ from linprim_geo.surface.fusion.voxel_blocks import (
     unpack_keys,
 )
 
-COARSE = 2.0
+COARSE_RATIO = 2.0
 """Size of the voxels of the coarse surface, which flat parts keep, in voxels of a grid of one size (`voxel_size`)."""
 
 MOST_HALVINGS = 4
@@ -71,7 +71,7 @@ class VoxelLevels:
         self, coarse: Lattice, surface: Mesh, frames: Iterable[DepthFrame], most_faces: float, limit: float = np.inf
     ):
         self.blocks, self.frames = _Blocks(coarse), frames
-        blocks, usual = self.blocks, coarse.voxel / COARSE
+        blocks, usual = self.blocks, coarse.voxel / COARSE_RATIO
         row = blocks.rows(surface.vertices)
         faces = 2.0 * np.bincount(row[row >= 0], minlength=blocks.count)
         planes, lost = _shapes(blocks, surface.vertices)
@@ -104,7 +104,7 @@ class VoxelLevels:
             else:  # give up the least halvings of blocks that have lost something, and start again with those that bend
                 least, eighths = np.zeros_like(least), 0
 
-    def mend(self, coarse: Mesh, fine: Mesh) -> bool:
+    def coarsen_torn_blocks(self, coarse: Mesh, fine: Mesh) -> bool:
         """Coarsen blocks where the `fine` surface, of the `lattice`, is torn. Return whether there were any.
 
         A surface is torn where depths lie on the `coarse` one and the fine one is missing: there the depths of

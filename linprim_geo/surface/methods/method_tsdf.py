@@ -31,7 +31,7 @@ from linprim_geo.surface.fusion.stereo_frames import MergedFrames
 from linprim_geo.surface.fusion.tsdf_field import DepthFrame
 from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size, fuse_tsdf
 from linprim_geo.surface.fusion.voxel_blocks import TooFine, estimate_memory
-from linprim_geo.surface.fusion.voxel_levels import COARSE
+from linprim_geo.surface.fusion.voxel_levels import COARSE_RATIO
 
 # A ray with less opacity than this sees through the scene: it votes for free space.
 SEEN_THROUGH = 0.5
@@ -139,7 +139,7 @@ def tsdf_surface(
                     min_component=smallest_part,
                     log=stages.note,
                     fuse=fuse,
-                    counts=None if options.voxel_size > 0 else supported,
+                    relevant_part=None if options.voxel_size > 0 else supported,
                 )
             except TooFine as error:
                 if options.voxel_size > 0 or not left:
@@ -235,8 +235,8 @@ def _better_by_stereo(
         return mesh, about | {"taken": True}
     stages.note(said)
     without_stereo = rendered()
-    vote = Vote(without_stereo, views)
-    about |= vote.on(mesh, vote.without - CLEARLY_LESS, stages)
+    choice = StereoChoice(without_stereo, views)
+    about |= choice.decide(mesh, choice.without - CLEARLY_LESS, stages)
     return mesh if about["taken"] else without_stereo, about
 
 
@@ -249,15 +249,15 @@ def _better_for_object(
     the surface of stereo.
     """
     without_stereo = rendered()
-    vote = Vote(without_stereo, views)
+    choice = StereoChoice(without_stereo, views)
     stages.lap("compare")
-    if vote.without >= ENOUGH_AGREE:
-        stages.note(f"no stereo: photographs agree at {vote.without:.1%} of the vertices without it")
+    if choice.without >= ENOUGH_AGREE:
+        stages.note(f"no stereo: photographs agree at {choice.without:.1%} of the vertices without it")
         return without_stereo, {}
     mesh, about = by_stereo()
     if mesh is None:
         return without_stereo, about
-    about |= vote.on(mesh, vote.without, stages)
+    about |= choice.decide(mesh, choice.without, stages)
     return mesh if about["taken"] else without_stereo, about
 
 
@@ -282,7 +282,7 @@ def _surface_of_stereo(
     return mesh, about | {"covered": merged.covered(mesh)}
 
 
-class Vote:
+class StereoChoice:
     """Lets the photographs decide between the surfaces without and with stereo. `without` is the share of the first
     one's vertices at which they agree; their exposures are estimated on that surface."""
 
@@ -291,7 +291,7 @@ class Vote:
         self.gains = photo_gains(without_stereo, [view.camera for view in views], (view.load() for view in views))
         self.without = _agreeing(without_stereo, views, self.gains)
 
-    def on(self, mesh: Mesh, least: float, stages: Stages) -> dict:
+    def decide(self, mesh: Mesh, least: float, stages: Stages) -> dict:
         """Return for the statistics whether the surface of stereo is taken, which it is if photographs agree at a share
         of its vertices above `least`, and both shares."""
         agreeing = _agreeing(mesh, self.views, self.gains)
@@ -458,13 +458,13 @@ def with_far_depths(frames: DepthFrames, options: ExtractOptions, voxel: float) 
 
     Frames stay as they are if a limit or a voxel size is given in the options.
     """
-    limit = _told_by_disparity([view.camera for view in frames.views], options.truncation * COARSE * voxel)
+    limit = _disparity_depth_limit([view.camera for view in frames.views], options.truncation * COARSE_RATIO * voxel)
     if options.depth_limit > 0 or options.voxel_size > 0 or limit <= frames.limit:
         return frames
     tries = FAR_TRIES if frames.kept else 1  # else each try renders all of them
     for farther in np.geomspace(limit, frames.limit, tries, endpoint=False):
         far = frames.up_to(float(farther))
-        if auto_voxel_size(far) <= COARSE * np.sqrt(0.5) * voxel:
+        if auto_voxel_size(far) <= COARSE_RATIO * np.sqrt(0.5) * voxel:
             return far
     return frames
 
@@ -476,10 +476,10 @@ def depth_limit(cameras: Sequence[Camera], median: float, truncation: float = 3.
     voxels as large as a pixel at the median depth.
     """
     pixel = median / _focal_length(cameras)
-    return max(NEAREST_LIMIT * median, _told_by_disparity(cameras, truncation * pixel))
+    return max(NEAREST_LIMIT * median, _disparity_depth_limit(cameras, truncation * pixel))
 
 
-def _told_by_disparity(cameras: Sequence[Camera], reach: float) -> float:
+def _disparity_depth_limit(cameras: Sequence[Camera], reach: float) -> float:
     """Return the depth beyond which SMALLEST_DISPARITY moves a point by more than `reach`.
 
     A disparity of d pixels between cameras b apart moves a point at depth z by d z^2 / (b f), a derivative of z = b f /

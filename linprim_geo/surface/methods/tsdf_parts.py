@@ -27,7 +27,7 @@ from linprim_geo.jobs import worker
 from linprim_geo.jobs.executor import Executor, Task
 from linprim_geo.kernels import ops
 from linprim_geo.runs.run import Run
-from linprim_geo.surface.fusion.tsdf_field import placed
+from linprim_geo.surface.fusion.tsdf_field import canonical_in_world
 from linprim_geo.surface.fusion.voxel_blocks import Lattice, block_keys, estimate_memory, touching, unpack_keys
 from linprim_geo.surface.methods.method_tsdf import DepthFrames
 
@@ -95,7 +95,7 @@ class PartFusion:
             )
         self.executor.run(tasks, Progress("parts", 1, quiet=self.quiet))
         parts = [load_part(place / f"{part:03d}" / "part.npz") for part in range(count)]
-        return placed(merge_parts(parts), lattice.origin)
+        return canonical_in_world(merge_parts(parts), lattice.origin)
 
 
 def owners(lattice: Lattice, count: int) -> np.ndarray:

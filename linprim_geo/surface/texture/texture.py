@@ -17,7 +17,7 @@ import numpy as np
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 from linprim_geo.surface.mesh_views import MeshViews
-from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, photographed, pixels_of, with_gain
+from linprim_geo.surface.visibility import POOR_RINGS, color_vertices, pixels_of, sample_photographs, with_gain
 
 if TYPE_CHECKING:
     from linprim_geo.capture.types import View
@@ -70,10 +70,10 @@ def make_texture(
     """Return the charts of a mesh and their colours from photographs.
 
     Each texel has a point of the surface; its colour is the robust mean of the views that see it
-    (`visibility.photographed`), so that highlights, exposure and occluders do not show. Texels that no view sees have
-    the colours of the mesh's vertices, which are taken from the photographs if it has none. Texels between charts have
-    the colour of the nearest one in a chart, so that mip-maps do not bleed. The same input gives the same texture to
-    the last bit, whatever the number of threads.
+    (`visibility.sample_photographs`), so that highlights, exposure and occluders do not show. Texels that no view sees
+    have the colours of the mesh's vertices, which are taken from the photographs if it has none. Texels between charts
+    have the colour of the nearest one in a chart, so that mip-maps do not bleed. The same input gives the same texture
+    to the last bit, whatever the number of threads.
 
     Args:
         size: texels along an edge of the image.
@@ -156,7 +156,9 @@ def _bake(mesh, corners, owner, rows, size, photographs):
         texel, face = rows[part], owner[rows[part]]
         weights = _nearest_in(np.stack([texel % size, texel // size], axis=1) + 0.5, corners[face])[0]
         points[part] = np.einsum("pk,pkc->pc", weights, mesh.vertices[mesh.faces[face]])
-        color[part], good[part], seen[part] = photographed(caster, points[part], normals[face], cameras, photographs)
+        color[part], good[part], seen[part] = sample_photographs(
+            caster, points[part], normals[face], cameras, photographs
+        )
         hidden = ~seen[part]
         if hidden.any():
             if behind is None:

@@ -24,7 +24,7 @@ from linprim_geo.surface.fusion.voxel_blocks import (
     touching,
     unpack_keys,
 )
-from linprim_geo.surface.fusion.voxel_levels import COARSE, NOISE_VOXELS, VoxelLevels
+from linprim_geo.surface.fusion.voxel_levels import COARSE_RATIO, NOISE_VOXELS, VoxelLevels
 from linprim_geo.synthetic.camera_paths import look_at
 
 SIZE, FOCAL, RADIUS = 160, 200.0, 0.12
@@ -63,10 +63,10 @@ def ball_on_floor(cameras, noise=0.0, rod=0.0) -> list[DepthFrame]:
 
 
 def coarse_lattice(frames) -> Lattice:
-    blocks, origin, _ = find_blocks(frames, COARSE * USUAL, 3.0, None, 4, np.inf)
+    blocks, origin, _ = find_blocks(frames, COARSE_RATIO * USUAL, 3.0, None, 4, np.inf)
     rules = vote_rules(3.0, 0.75, 0.0)
     levels = np.zeros(len(blocks), np.int64)
-    return Lattice(blocks, levels, levels, origin, COARSE * USUAL, 4, 3.0, rules)
+    return Lattice(blocks, levels, levels, origin, COARSE_RATIO * USUAL, 4, 3.0, rules)
 
 
 def split(frames, most_faces=1e6, limit=np.inf) -> Lattice:
@@ -75,7 +75,7 @@ def split(frames, most_faces=1e6, limit=np.inf) -> Lattice:
 
 
 def fused(frames, **options) -> Mesh:
-    return fuse_tsdf(frames, voxel_size=USUAL, counts=lambda surface: surface, **options)
+    return fuse_tsdf(frames, voxel_size=USUAL, relevant_part=lambda surface: surface, **options)
 
 
 def edges_near(mesh: Mesh, near) -> float:
@@ -107,11 +107,11 @@ def mesh(frames):
 def test_a_ball_on_a_floor_has_small_voxels_and_the_floor_large_ones(frames, mesh):
     uniform = fuse_tsdf(frames, voxel_size=USUAL)
     floor = lambda points: (np.linalg.norm(points[:, :2], axis=1) > 0.6) & (np.abs(points).max(1) < 0.9)  # noqa: E731
-    assert edges_near(mesh, floor) == pytest.approx(COARSE * edges_near(uniform, floor), rel=0.1)
+    assert edges_near(mesh, floor) == pytest.approx(COARSE_RATIO * edges_near(uniform, floor), rel=0.1)
     assert edges_near(mesh, on_ball) < edges_near(uniform, on_ball) / 1.8
     assert ball_error(mesh) < ball_error(uniform) / 1.4
     flat = mesh.vertices[floor(mesh.vertices)]
-    assert np.abs(flat[:, 2]).max() < 0.0061 * COARSE * USUAL  # see tsdf_field.ZERO_GAP
+    assert np.abs(flat[:, 2]).max() < 0.0061 * COARSE_RATIO * USUAL  # see tsdf_field.ZERO_GAP
 
 
 def test_it_has_no_cracks_where_sizes_change(mesh):
@@ -152,7 +152,7 @@ def test_what_coarse_voxels_lose_has_the_usual_ones():
     """A rod much thinner than a coarse voxel."""
     rod = ball_on_floor(around(24), rod=0.45 * USUAL)
     on_rod = lambda points: (points[:, 2] > 0.25).sum()  # noqa: E731
-    coarse = fuse_tsdf(rod, voxel_size=COARSE * USUAL, min_component=0)
+    coarse = fuse_tsdf(rod, voxel_size=COARSE_RATIO * USUAL, min_component=0)
     usual = fuse_tsdf(rod, voxel_size=USUAL, min_component=0)
     assert on_rod(coarse.vertices) < on_rod(usual.vertices) / 20
     found = fused(rod, min_component=0)
@@ -197,11 +197,11 @@ def test_where_small_voxels_tear_the_surface_the_usual_ones_mend_it(frames):
     coarse = fuse_lattice(lattice, frames)
     levels = VoxelLevels(lattice, coarse, frames, 1e6)
     fine = fuse_lattice(levels.lattice, frames)
-    assert not levels.mend(coarse, fine)  # what both end at is no tear
+    assert not levels.coarsen_torn_blocks(coarse, fine)  # what both end at is no tear
     hole = np.linalg.norm(fine.vertices[fine.faces].mean(1) - [0, 0, 2 * RADIUS], axis=1) > 0.04
     at_top = lambda points: np.linalg.norm(points - [0, 0, 2 * RADIUS], axis=1) < 0.03  # noqa: E731
     assert edges_near(fine, at_top) < 0.6 * USUAL
-    assert hole.any() and levels.mend(coarse, select_faces(fine, hole))
+    assert hole.any() and levels.coarsen_torn_blocks(coarse, select_faces(fine, hole))
     mended = fuse_lattice(levels.lattice, frames)
     assert edges_near(mended, at_top) > 0.6 * USUAL and levels.lattice.voxel < USUAL  # no other block was torn
     assert mended.vertices[:, 2].max() > 1.9 * RADIUS and topology(mended)["non_manifold_edges"] == 0
@@ -219,7 +219,9 @@ def test_blocks_are_divided_as_far_as_memory_goes(frames):
 def test_a_coarse_field_that_does_not_fit_is_refused_with_a_size_that_does(frames):
     with pytest.raises(TooFine) as caught:
         fused(frames, memory_limit=9_000_000)
-    found = fuse_tsdf(frames, voxel_size=caught.value.fits, counts=lambda surface: surface, memory_limit=9_000_000)
+    found = fuse_tsdf(
+        frames, voxel_size=caught.value.fits, relevant_part=lambda surface: surface, memory_limit=9_000_000
+    )
     assert caught.value.fits > USUAL and len(found.faces) > 1000
     sizes = f"voxel size {USUAL:.4g} needs .* allowed: a voxel size of {caught.value.fits:.2g} fits"
     assert re.fullmatch(sizes, str(caught.value))

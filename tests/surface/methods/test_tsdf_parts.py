@@ -15,7 +15,7 @@ from linprim_geo.base.options import ExtractOptions
 from linprim_geo.jobs import worker
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh
-from linprim_geo.surface.fusion.tsdf_field import placed, vote_rules
+from linprim_geo.surface.fusion.tsdf_field import canonical_in_world, vote_rules
 from linprim_geo.surface.fusion.tsdf_fusion import fuse_lattice
 from linprim_geo.surface.fusion.voxel_blocks import Lattice, find_blocks
 from linprim_geo.surface.methods.method_tsdf import DepthFrames
@@ -65,7 +65,7 @@ def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, t
     else:  # nearly every block is a seam
         owner = np.random.default_rng(0).integers(0, 3, len(made.blocks))
     parts = parts_of(tiny_run, made, owner, tmp_path)
-    mesh = placed(merge_parts(parts), made.origin)
+    mesh = canonical_in_world(merge_parts(parts), made.origin)
     assert len(whole.faces) > 1000 and all(len(part.faces) for part in parts)
     assert np.array_equal(mesh.vertices, whole.vertices) and np.array_equal(mesh.faces, whole.faces)
     assert sum(len(part.faces) for part in parts) == len(whole.faces)  # nothing twice

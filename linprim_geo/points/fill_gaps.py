@@ -62,7 +62,7 @@ _AT_ONCE = 64
 _BACKDROP = 25.5
 
 
-def densify(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None) -> PointCloud:
+def fill_gaps(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None) -> PointCloud:
     """Return the scene's points followed by new ones in the image cells of training views that contain none.
 
     In three rounds, views are visited in order of their number of points. Each empty cell gets a candidate at a random

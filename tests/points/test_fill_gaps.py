@@ -12,8 +12,8 @@ from PIL import Image
 
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.types import PointCloud, Scene
-from linprim_geo.points import densify as filling
-from linprim_geo.points.densify import _differences, _Gaps, _not_in_free_space, _sources, densify
+from linprim_geo.points import fill_gaps as filling
+from linprim_geo.points.fill_gaps import _differences, _Gaps, _not_in_free_space, _sources, fill_gaps
 from linprim_geo.points.initial_points import evenly_spread_views, local_planes
 
 # A room of 4 x 4 x 3: the far wall at y = 2, the floor at z = -1.5, a box in front of the wall.
@@ -97,7 +97,7 @@ def on_box(xyz):
 
 def test_gaps_between_points_are_filled_on_the_surface(room):
     given = len(room.points.xyz)
-    cloud = densify(room, seed=0)
+    cloud = fill_gaps(room, seed=0)
     np.testing.assert_array_equal(cloud.xyz[:given], room.points.xyz)
     new = cloud.xyz[given:]
     assert len(new) > given / 2 and cloud.rgb.shape == cloud.xyz.shape and cloud.rgb.dtype == np.uint8
@@ -113,7 +113,7 @@ def test_gaps_between_points_are_filled_on_the_surface(room):
 def test_an_object_without_features_is_found_by_its_colours(room):
     assert on_box(room.points.xyz).sum() <= 60  # floor points at its foot
     given = len(room.points.xyz)
-    new = densify(room, seed=0)
+    new = fill_gaps(room, seed=0)
     box = on_box(new.xyz[given:]) & (new.xyz[given:, 2] > -1.2)
     rgb = new.rgb[given:].astype(int)[box]
     green = rgb[:, 1] > rgb[:, 0]
@@ -124,14 +124,14 @@ def test_what_nothing_tells_of_lies_behind_all_that_is_known(room):
     """In the middle of the room it would be fog between the cameras. At the depth of the nearest points 0.021 of the
     new points were there."""
     given = len(room.points.xyz)
-    new = densify(room, seed=0).xyz[given:]
+    new = fill_gaps(room, seed=0).xyz[given:]
     free = surface_distance(new) > 0.02 * 3.5
     within = (new[:, 1] < 2.0) & (new[:, 2] > -1.5) & (new[:, 1] > -1.0)
     assert (free & within).mean() < 0.015
 
 
 def test_two_calls_give_the_same_points_and_another_seed_others(room):
-    first, again, other = (densify(room, seed=seed).xyz for seed in (3, 3, 4))
+    first, again, other = (fill_gaps(room, seed=seed).xyz for seed in (3, 3, 4))
     assert first.tobytes() == again.tobytes()
     assert first.shape != other.shape or (first != other).any()
 
@@ -147,7 +147,7 @@ def full_cloud(room):
 
 def test_where_cells_are_full_nothing_is_added(room):
     full = full_cloud(room)
-    assert len(densify(full, seed=0).xyz) <= 1.01 * len(full.points.xyz)
+    assert len(fill_gaps(full, seed=0).xyz) <= 1.01 * len(full.points.xyz)
 
 
 def test_masked_background_gets_no_points(room, tmp_path):
@@ -162,7 +162,7 @@ def test_masked_background_gets_no_points(room, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(transforms(cameras(), paths)))
     scene = with_cloud(load_scene(tmp_path), room.points.xyz)
     assert scene.has_alpha
-    cloud = densify(scene, seed=0)
+    cloud = fill_gaps(scene, seed=0)
     new = cloud.rgb[len(scene.points.xyz) :]
     assert len(new) > 100
     np.testing.assert_allclose(new, np.broadcast_to(COLORS["wall"], new.shape), atol=1)
@@ -171,8 +171,8 @@ def test_masked_background_gets_no_points(room, tmp_path):
 def test_a_plain_backdrop_gets_no_points(room):
     given = len(room.points.xyz)
     backdrop = np.array(COLORS["wall"]) / 255
-    with_it = densify(room, seed=0).rgb[given:].astype(int)
-    without = densify(room, seed=0, backdrop=backdrop).rgb[given:].astype(int)
+    with_it = fill_gaps(room, seed=0).rgb[given:].astype(int)
+    without = fill_gaps(room, seed=0, backdrop=backdrop).rgb[given:].astype(int)
     like = [np.abs(rgb - COLORS["wall"]).max(1) <= 20 for rgb in (with_it, without)]
     assert like[0].sum() > 100 and like[1].sum() == 0 and len(without) > 100
 
@@ -212,7 +212,7 @@ def test_patches_agree_at_the_true_depth(room):
     ids=["few", "line", "one place", "behind"],
 )
 def test_clouds_that_span_nothing_are_left_alone_or_filled_finitely(room, xyz):
-    cloud = densify(with_cloud(room, xyz), seed=0)
+    cloud = fill_gaps(with_cloud(room, xyz), seed=0)
     np.testing.assert_array_equal(cloud.xyz[: len(xyz)], xyz)
     assert np.isfinite(cloud.xyz).all() and len(cloud.rgb) == len(cloud.xyz)
 
