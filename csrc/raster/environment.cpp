@@ -9,18 +9,18 @@
 namespace linprim {
 namespace {
 
-// Samples that are kept at once, of at most 32 bytes.
+// Samples that the backward pass buffers at a time, but at least one image row. A sample has at most 32 bytes.
 constexpr int64_t kSamplesAtOnce = 65536;
 
-// The place of a direction on the cube: a face, and coordinates in texels along its columns and rows, 0 at the first
-// centre.
+// Position of a direction on the cube map: a face, and coordinates in texels along its columns and rows, 0 at the
+// centre of the first texel.
 struct Place {
   int face;
   double column, row;
 };
 
-// The texels round a place, by the index of their first channel, left to right and top to bottom, and how far it lies
-// from the first one.
+// Bilinear sample at a place: the index of the first channel of the four texels around it, left to right and top to
+// bottom, and the offset of the place from the first texel, in texels.
 template <class Real>
 struct Sample {
   int32_t texel[4];
@@ -29,6 +29,7 @@ struct Sample {
   Real weight(int k) const { return (k % 2 ? across : 1 - across) * (k / 2 ? down : 1 - down); }
 };
 
+// Projects a direction onto the cube face of its largest coordinate.
 inline Place place_of(double dx, double dy, double dz, int size) {
   const double x = std::abs(dx), y = std::abs(dy), z = std::abs(dz);
   const bool first = (x >= y) & (x >= z), second = !first & (y >= z);
@@ -42,10 +43,11 @@ inline Place place_of(double dx, double dy, double dz, int size) {
           across * scale + (half - 0.5), down * scale + (half - 0.5)};
 }
 
+// Returns the index of the first channel of a texel.
 int32_t texel_index(int size, int face, int row, int column) { return ((face * size + row) * size + column) * 3; }
 
-// The texel of a face's lattice, which goes on by one beyond its border: there it is the nearest one of the
-// neighbouring face.
+// Returns the texel at a row and column of a face. Rows and columns may lie one texel beyond its border: there, the
+// nearest texel of the neighbouring face is returned.
 int32_t texel_at(int size, int face, int row, int column) {
   if (row >= 0 && row < size && column >= 0 && column < size) return texel_index(size, face, row, column);
   const int axis = face / 2;
@@ -57,9 +59,10 @@ int32_t texel_at(int size, int face, int row, int column) {
   return texel_index(size, other.face, nearest(other.row), nearest(other.column));
 }
 
+// Returns the texels and offsets for bilinear interpolation at a place.
 template <class Real>
 Sample<Real> sample(const Place& place, int size) {
-  const int left = int(place.column + 1) - 1, top = int(place.row + 1) - 1;  // rounded down, for both are above -1
+  const int left = int(place.column + 1) - 1, top = int(place.row + 1) - 1;  // rounds down, as both are above -1
   Sample<Real> result{{}, Real(place.column - left), Real(place.row - top)};
   if (left >= 0 && top >= 0 && left + 1 < size && top + 1 < size) {
     const int32_t first = texel_index(size, place.face, top, left), below = first + 3 * size;
@@ -70,7 +73,8 @@ Sample<Real> sample(const Place& place, int size) {
   return result;
 }
 
-// Calls visit(column, sample) for the pixels of a row whose ray has not ended.
+// Calls visit(column, sample) for the pixels of an image row whose ray has not ended: 1 - opacity is at least `least`.
+// `opacity` points to that row.
 template <class Real, class Visit>
 void for_each_sample(const DirectionView& view, int size, double least, int row, const Real* opacity,
                      const Visit& visit) {
@@ -93,7 +97,8 @@ void for_each_sample(const DirectionView& view, int size, double least, int row,
   }
 }
 
-// Adds to the texels of a map what pixels hand in; neighbours with the same texels are summed before.
+// Accumulates the gradients of pixels into the texels of a map. Consecutive pixels that share all four texels are
+// summed first and added to the map together; flush() adds the last such sum.
 template <class Real>
 class Gathered {
  public:
@@ -146,7 +151,8 @@ void environment_light_grad(const DirectionView& view, int size, double least, c
                             const Real* light_grad, Real* map_grad) {
   const int64_t pixels = int64_t(view.width) * view.height;
   std::fill_n(map_grad, int64_t(6) * size * size * 3, Real(0));
-  // Some rows at a time: their samples in parallel, then the sums over texels, which pixels share, in one order.
+  // In blocks of rows: computes the samples in parallel, then adds them to the texels, which pixels share, on one
+  // thread in a fixed order.
   const int rows = std::clamp(int(kSamplesAtOnce / view.width), 1, view.height);
   std::vector<Sample<Real>> samples(size_t(rows) * view.width);
   for (int top = 0; top < view.height; top += rows) {

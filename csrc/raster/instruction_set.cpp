@@ -1,4 +1,4 @@
-// Choosing, at run time, among the builds of the kernels that this processor can run.
+// Selects, at run time, one of the kernel builds that this processor can run.
 #include "raster/instruction_set.h"
 
 #include <atomic>
@@ -10,14 +10,14 @@
 namespace linprim {
 namespace {
 
-struct Choice {
+struct Choice {  // kernels of one instruction set
   const Kernels<float>* kernels;
   const ImageKernels* image;
 };
 
-constexpr int kChoices = 5;
+constexpr int kChoices = 5;  // capacity of the list of choices
 
-// Best first. Entries this processor cannot run are left out.
+// Lists the builds that this processor can run, best first, and returns their number.
 int available(Choice (&out)[kChoices]) {
   int count = 0;
 #if defined(__x86_64__) || defined(_M_X64)
@@ -38,6 +38,7 @@ int available(Choice (&out)[kChoices]) {
   return count;
 }
 
+// Returns the build of that name, or the best one for "auto"; null if the processor cannot run it or it does not exist.
 const Choice* find(const char* name) {
   static Choice choices[kChoices];
   static const int count = available(choices);
@@ -47,6 +48,7 @@ const Choice* find(const char* name) {
   return nullptr;
 }
 
+// Returns the selected build: at first that of LINPRIM_GEO_ISA, or the best one if that is not set or not available.
 std::atomic<const Choice*>& current() {
   static std::atomic<const Choice*> choice = [] {
     const char* wanted = std::getenv("LINPRIM_GEO_ISA");

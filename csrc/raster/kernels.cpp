@@ -1,8 +1,8 @@
 // The hot loops, compiled once per instruction set: LINPRIM_ISA is scalar, v2, v3, v4 (x86-64) or neon, and
 // LINPRIM_ISA_<NAME> is 1.
 //
-// Everything included here lives in namespace linprim::LINPRIM_ISA. Only the two table functions at the end are seen
-// outside.
+// Everything included here lives in namespace linprim::LINPRIM_ISA. Only the two table functions at the end,
+// `kernels_...` and `image_kernels_...`, are visible outside.
 #ifndef LINPRIM_ISA
 #error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
 #endif
@@ -21,6 +21,7 @@
 namespace linprim {
 namespace LINPRIM_ISA {
 
+// SIMD lanes per vector.
 #if defined(LINPRIM_ISA_V4)
 constexpr int kWidth = 16;
 #elif defined(LINPRIM_ISA_V3)
@@ -31,7 +32,7 @@ constexpr int kWidth = 1;
 constexpr int kWidth = 4;
 #endif
 
-// Enough for the larger of the two passes.
+// Returns the bytes of scratch that a thread needs for its longest tile list; enough for the larger of the two passes.
 template <class Kind>
 int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
   if (order == Order::kEntry)
@@ -43,6 +44,8 @@ int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
   return 0;
 }
 
+// Fills the kernel table of one primitive kind under one ray model. First index of `forward` and `backward`: centre,
+// entry, overlap order.
 template <class Kind>
 constexpr SolidKernels<typename Kind::Real> solid_kernels(void (*project)(const ProjectParams<typename Kind::Real>&,
                                                                           int64_t, int64_t),
@@ -66,12 +69,13 @@ constexpr SolidKernels<typename Kind::Real> solid_kernels(void (*project)(const 
   return k;
 }
 
+// Fills the table of all kernels of this instruction set.
 template <class Real>
 constexpr Kernels<Real> all_kernels(const char* name) {
   constexpr RayModel kExact = RayModel::kExact, kAffine = RayModel::kAffine;
   Kernels<Real> k{};
   k.name = name, k.width = kWidth, k.bin = bin<kWidth>;
-  // A row for each kind, in the order of PrimitiveKind.
+  // One row per kind, in the order of PrimitiveKind; one column per ray model.
   k.solids[0][0] =
       solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
   k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>,

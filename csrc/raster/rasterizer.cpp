@@ -1,5 +1,5 @@
-// The rasterizer's pipeline: project, sort by depth, bin into tiles, blend; and back: tiles, reduction per primitive,
-// chain.
+// The rasterizer's pipeline. Forward: project, sort by depth, bin into tiles, blend. Backward: blend backward per tile,
+// sum the gradients of each primitive over its tiles, apply the chain rule of the projection.
 #include <algorithm>
 #include <array>
 #include <bit>
@@ -18,8 +18,9 @@
 namespace linprim {
 namespace {
 
-constexpr int64_t kPrimitivesPerTask = 512;
+constexpr int64_t kPrimitivesPerTask = 512;  // of projection and of its chain rule
 
+// Measures the milliseconds between calls of lap().
 class Stopwatch {
  public:
   double lap() {
@@ -33,18 +34,18 @@ class Stopwatch {
   std::chrono::steady_clock::time_point last_ = std::chrono::steady_clock::now();
 };
 
-Statistics last_statistics{};
+Statistics last_statistics{};  // of the latest forward pass and the backward passes since
 
-// Memory for records of any kind.
+// A cache line: unit of memory for records of any kind and for scratch.
 struct alignas(64) Line {
   char bytes[64];
 };
 
-// Everything between the primitives and the pixels of one view. Buffers only grow, so a view after the first allocates
-// nothing.
+// Intermediate data of one view: projected primitives, their depth order, tile lists and gradient sums. Buffers only
+// grow, so a view after the first allocates nothing unless it needs more.
 template <class Real>
 struct Frame {
-  uint64_t hash = 0, used = 0;
+  uint64_t hash = 0, used = 0;  // content hash of the inputs, 0 for none; clock of the cache at the last use
   int tiles_x = 0, tiles_y = 0;
   int64_t rows = 0, visible = 0, pair_count = 0;
   const SolidKernels<Real>* solid = nullptr;
@@ -53,25 +54,28 @@ struct Frame {
   std::vector<Footprint> footprints;
   std::vector<Real> key;
   std::vector<uint32_t> order, order_swap, keys, keys_swap;
-  // What a projection task found: its visible rows, and its pairs, in the list of the thread that ran it.
+  // Result of a projection task: number of visible rows, first gradient slot, and the range of its pairs in the list of
+  // the thread that ran it.
   struct Task {
     uint32_t visible, first_slot;
     int thread;
     int64_t pairs_begin, pairs;
   };
   std::vector<Task> tasks;
-  std::vector<std::vector<LoosePair>> loose;  // of every thread
-  std::vector<int64_t> loose_count;
-  std::vector<uint32_t> tile_count;  // threads x tiles
-  std::vector<uint32_t> chunk_tile;  // chunks x tiles: counts, then write positions
+  std::vector<std::vector<LoosePair>> loose;  // pairs, one list per thread
+  std::vector<int64_t> loose_count;           // pairs in each of these lists
+  std::vector<uint32_t> tile_count;           // threads x tiles
+  std::vector<uint32_t> chunk_tile;           // chunks x tiles: counts, then write positions
   std::vector<uint32_t> tile_begin, first_slot, slot_count;
   std::vector<uint32_t> pair_primitive, pair_slot, pair_blocks;
   std::vector<Real> pair_weight, sums, background_sums;
   std::vector<uint32_t> pair_pixels;
-  std::vector<Line> scratch;  // of every thread
+  std::vector<Line> scratch;  // one part per thread
 
   int tiles() const { return tiles_x * tiles_y; }
 
+  // Projects the primitives, sorts the visible ones by depth and builds the tile lists. Writes `color`, and times and
+  // counts to `stats`.
   void build(const View& view, const Primitives<Real>& p, bool geometry, Real* color, Statistics& stats) {
     Stopwatch watch;
     tiles_x = (view.width + kTile - 1) / kTile, tiles_y = (view.height + kTile - 1) / kTile;
@@ -105,15 +109,15 @@ struct Frame {
     stats.working_set_bytes = bytes();
   }
 
-  // The bits of a key as an unsigned number of the same order; -0 as 0.
+  // Maps a key to an unsigned integer with the same order; -0 maps to the same integer as 0.
   static uint32_t ordered_bits(float key) {
     const uint32_t bits = std::bit_cast<uint32_t>(key + 0.0f);
     return bits ^ ((bits >> 31) ? 0xffffffffu : 0x80000000u);
   }
 
-  // The part of sorting and binning that belongs to the rows of one projection task, while their footprints are in the
-  // cache: the visible ones with their keys, at the beginning of the task's rows of `order` and `keys`, and their
-  // pairs.
+  // Does the part of sorting and binning for the rows of one projection task, while their footprints are in the cache.
+  // Writes the visible rows and their keys to the beginning of the task's rows of `order` and `keys`, and appends their
+  // pairs to the list of the thread.
   void collect(int64_t index, int64_t begin, int64_t end, int thread) {
     Task& task = tasks[index];
     int64_t count = begin;
@@ -138,7 +142,7 @@ struct Frame {
     task.pairs = loose_count[thread] - task.pairs_begin;
   }
 
-  // Visible primitives by ascending key; ties keep the order of input.
+  // Sorts the visible primitives by ascending key; ties keep the order of input.
   void sort() {
     int64_t at = 0;
     for (int64_t t = 0; t < int64_t(tasks.size()); ++t) {  // close the gaps between the tasks
@@ -152,7 +156,7 @@ struct Frame {
       std::stable_sort(order.begin(), order.begin() + visible, [&](uint32_t a, uint32_t b) { return key[a] < key[b]; });
       return;
     }
-    // Radix sort on the bits in which the keys differ, as many passes as they need of at most kMaxBits.
+    // Radix sort of the keys minus the lowest one, in the fewest passes of at most kMaxBits bits each.
     constexpr int kMaxBits = 11, kMaxPasses = 3;
     uint32_t low = ~0u, high = 0;
     for (int64_t i = 0; i < visible; ++i) low = std::min(low, keys[i]), high = std::max(high, keys[i]);
@@ -177,12 +181,13 @@ struct Frame {
     }
   }
 
-  // Tile lists, each in the order of `order`; the gradient slots of a primitive are consecutive, in the order of input.
+  // Builds the tile lists, each in the order of `order`. The gradient slots of a primitive are consecutive; primitives
+  // have theirs in the order of input.
   void bin() {
     int64_t pairs_in_all = 0;
     for (const Task& task : tasks) pairs_in_all += task.pairs;
     if (pairs_in_all >= int64_t(1) << 32)
-      throw std::bad_alloc();  // slots are counted in 32 bits; this is above 200 GiB of them
+      throw std::bad_alloc();  // slot indices have 32 bits; 2^32 slots take more than 200 GiB
     pair_count = pairs_in_all;
     uint32_t slot = 0;
     for (int64_t t = 0, i = 0; t < int64_t(tasks.size()); ++t) {
@@ -190,7 +195,8 @@ struct Frame {
       for (const int64_t end = std::min(i + kPrimitivesPerTask, int64_t(rows)); i < end; ++i)
         first_slot[i] = slot, slot += slot_count[i];
     }
-    // Chunks of the order are put in place at the same time: each begins in a tile's list where those before it end.
+    // Counting sort by tile: chunks of `order` are written to the lists in parallel. In each tile's list, a chunk
+    // begins where the chunks before it end.
     const int chunks = threads() == 1 ? 1 : 4 * threads();
     auto begin_of = [&](int64_t chunk) { return visible * chunk / chunks; };
     auto pairs_of = [&](uint32_t primitive) {
@@ -198,9 +204,8 @@ struct Frame {
       return loose[task.thread].data() + task.pairs_begin + (first_slot[primitive] - task.first_slot);
     };
     auto each_pair = [&](int64_t chunk, auto body) {
-      constexpr int64_t
-          kFar = 24,
-          kNear = 12;  // how far ahead of its use, in primitives, memory is fetched: order is not order of input
+      // Prefetch distances in primitives: `order` visits memory at random.
+      constexpr int64_t kFar = 24, kNear = 12;
       const int64_t end = begin_of(chunk + 1);
       for (int64_t i = begin_of(chunk); i < end; ++i) {
         if (i + kFar < end)
@@ -237,19 +242,21 @@ struct Frame {
     });
   }
 
-  // Calls body(tile, thread, scratch) for every tile; each thread has scratch of its own.
+  // Calls body(tile, thread, scratch) for every tile in parallel; `scratch` belongs to the calling thread.
   template <class Body>
   void each_tile(int64_t scratch_bytes, Body body) {
     const int64_t lines = (scratch_bytes + 63) / 64;
     grow(scratch, lines * threads());
     parallel_for(tiles(), [&](int64_t tile, int thread) { body(int(tile), thread, scratch.data() + lines * thread); });
   }
+  // Returns the number of pairs of the longest tile list.
   int64_t longest_list() const {
     uint32_t longest = 0;
     for (int tile = 0; tile < tiles(); ++tile) longest = std::max(longest, tile_begin[tile + 1] - tile_begin[tile]);
     return longest;
   }
 
+  // Returns the parameters of the tile kernels for this frame.
   RasterParams<Real> raster(const View& view, const Real* background, const Planes<Real>& out) {
     return {view,
             tiles_x,
@@ -271,6 +278,7 @@ struct Frame {
   static void grow(std::vector<T>& v, int64_t size) {
     if (int64_t(v.size()) < size) v.resize(size);
   }
+  // Returns the memory that the buffers take.
   int64_t bytes() const {
     auto of = [](const auto& v) { return int64_t(v.capacity() * sizeof(v[0])); };
     int64_t total = of(records) + of(normals) + of(footprints) + of(key) + of(order) + of(order_swap) + of(keys) +
@@ -282,18 +290,20 @@ struct Frame {
   }
 };
 
-// The last few frames, so that a backward pass finds the tile lists of its forward pass.
+// The frames of the last views, so that a backward pass finds the tile lists of its forward pass. Guarded by `mutex`.
 template <class Real>
 struct Cache {
   std::mutex mutex;
   uint64_t clock = 0;
   std::array<std::unique_ptr<Frame<Real>>, 2> frames;
 
+  // Returns the frame with that content hash, or null.
   Frame<Real>* find(uint64_t hash) {
     for (auto& frame : frames)
       if (frame && frame->hash == hash) return frame->used = ++clock, frame.get();
     return nullptr;
   }
+  // Returns an unused frame, or the least recently used one, to be overwritten.
   Frame<Real>& oldest() {
     std::unique_ptr<Frame<Real>>* chosen = &frames[0];
     for (auto& frame : frames)
@@ -304,6 +314,7 @@ struct Cache {
     return **chosen;
   }
 };
+// One cache per precision, never destroyed.
 template <class Real>
 Cache<Real>& cache() {
   static auto* instance = new Cache<Real>;
