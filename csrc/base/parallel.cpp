@@ -18,6 +18,7 @@
 namespace linprim {
 namespace {
 
+// A fixed number of threads, the calling one included, that take the items of a job from a shared counter.
 class Pool {
  public:
   explicit Pool(int count) : count_(count) {
@@ -33,6 +34,7 @@ class Pool {
   }
   int count() const { return count_; }
 
+  // Calls body(item, thread) for every item, and rethrows the first exception of a body.
   void run(int64_t items, const std::function<void(int64_t, int)>& body) {
     if (count_ == 1 || items <= 1) {
       for (int64_t i = 0; i < items; ++i) body(i, 0);
@@ -50,15 +52,17 @@ class Pool {
   }
 
  private:
+  // Processes items until none is left.
   void drain(int thread) {
     try {
       for (int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < items_;) (*body_)(i, thread);
-    } catch (...) {  // out of memory: the others finish, and run() throws it on the caller's thread
+    } catch (...) {  // out of memory: the others finish their item; run() rethrows it on the caller's thread
       next_ = items_;
       std::lock_guard lock(mutex_);
       if (!failure_) failure_ = std::current_exception();
     }
   }
+  // Loop of a worker: waits for a job, processes items, reports the end.
   void work(int thread) {
     uint64_t seen = 0;
     std::unique_lock lock(mutex_);
@@ -78,17 +82,18 @@ class Pool {
   std::mutex mutex_;
   std::condition_variable wake_, done_;
   const std::function<void(int64_t, int)>* body_ = nullptr;
-  std::atomic<int64_t> next_{0};
+  std::atomic<int64_t> next_{0};  // item that is taken next
   int64_t items_ = 0;
   std::exception_ptr failure_;
-  int busy_ = 0;
-  uint64_t job_ = 0;
+  int busy_ = 0;      // workers that have not finished the job
+  uint64_t job_ = 0;  // number of jobs so far
   bool stop_ = false;
 };
 
 int cores() { return int(std::max(1u, std::thread::hardware_concurrency())); }
 
-// The pool and its lock. Deliberately leaked: joining threads while the process unloads its libraries can hang.
+// The pool and its lock, which serializes jobs. Deliberately leaked: joining threads while the process unloads its
+// libraries can hang.
 struct Shared {
   std::mutex mutex;
   std::unique_ptr<Pool> pool = std::make_unique<Pool>(cores());
@@ -99,8 +104,8 @@ Shared*& shared_pointer() {
 }
 Shared& shared() {
 #if !defined(_WIN32)
-  // A forked child has the pool's memory but none of its threads, and perhaps a lock that nobody will release: it gets
-  // new ones.
+  // A forked child has the pool's memory but none of its threads, and perhaps a lock that no thread will release. It
+  // gets a new pool and lock.
   static pid_t owner = getpid();
   if (owner != getpid()) {
     owner = getpid();
