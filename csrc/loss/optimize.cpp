@@ -14,7 +14,7 @@ namespace linprim {
 Photometric photometric_loss(const float* image, const float* target, const float* weight, int width, int height,
                              float dssim, float* gradient) {
   constexpr double kNoWeight = 1e-12;
-  constexpr int kMinRows = 64;  // of a part: a part also computes most of what belongs to the 20 rows around it
+  constexpr int kMinRows = 64;  // of a part, which also computes most intermediate values of the 20 rows around it
   static std::mutex mutex;
   static auto* buffers = new std::vector<float>;
   std::lock_guard lock(mutex);
@@ -26,7 +26,7 @@ Photometric photometric_loss(const float* image, const float* target, const floa
     for (int64_t i = 0; i < plane; ++i) params.weight_sum += weight[i];
   }
   params.weight_sum = std::max(3 * params.weight_sum, kNoWeight);
-  // Sums are kept by row and tile, so that how the rows are divided among threads does not matter to them.
+  // Sums are kept per row and tile, so that the result does not depend on how rows are divided among threads.
   const int tiles = photometric_tiles(width), columns = 3 * tiles;
   int parts = threads() == 1 ? 1 : (2 * threads() + columns - 1) / columns;
   parts = std::clamp(parts, 1, std::max(1, height / kMinRows));
@@ -42,7 +42,7 @@ Photometric photometric_loss(const float* image, const float* target, const floa
   double lost = 0;
   for (const auto& [l1, square, off] : sums) result.l1 += l1, result.mse += square, lost += off;
   result.l1 /= params.weight_sum, result.mse /= params.weight_sum, result.ssim = 1.0 - lost / params.weight_sum;
-  if (params.weight_sum <= kNoWeight) return {0, 0, 1, 0};  // no pixel counts, and the gradient is 0 already
+  if (params.weight_sum <= kNoWeight) return {0, 0, 1, 0};  // no weights; the kernel wrote a gradient of 0
   result.loss = (1.0 - dssim) * result.l1 + dssim * (1.0 - result.ssim);
   return result;
 }
@@ -68,17 +68,19 @@ void adam_step(float* value, const float* gradient, float* first, float* second,
 
 namespace {
 
-// Bias corrections of Adam by the number of steps, until both are 1 in single precision.
+// Table of Adam's bias corrections, 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for step t, until both are 1 in single
+// precision.
 struct Corrections {
   float beta1 = -1, beta2 = -1;
   std::vector<float> inverse, root;
   bool complete = false;
 
+  // Fills the table, unless it is for these betas already.
   void make(float b1, float b2) {
-    constexpr int kMost = 1 << 16;  // enough for beta2 = 0.9997; above that the kernel computes them beyond
+    constexpr int kMost = 1 << 16;  // enough for beta2 = 0.9997; for larger ones the kernel computes the steps beyond
     if (b1 == beta1 && b2 == beta2) return;
     beta1 = b1, beta2 = b2, complete = false;
-    inverse.assign(1, 1.0f), root.assign(1, 1.0f);  // step 0 does not happen
+    inverse.assign(1, 1.0f), root.assign(1, 1.0f);  // step 0 is not used
     double power1 = 1, power2 = 1;
     for (int t = 1; t < kMost && !complete; ++t) {
       power1 *= double(b1), power2 *= double(b2);
@@ -115,7 +117,8 @@ void adam_rows(const RowTensor* tensors, int count, int64_t n, const uint8_t* to
 
 namespace {
 
-// One row of means; factor 2, the usual one, as a loop that the compiler can vectorise.
+// Writes one row of means of factor x factor pixels. Factor 2, the usual one, has a loop that the compiler can
+// vectorise.
 template <class Real>
 void average_row(const Real* fine, int width, int factor, Real* __restrict out) {
   const int64_t pitch = int64_t(width) * factor;
@@ -132,6 +135,7 @@ void average_row(const Real* fine, int width, int factor, Real* __restrict out) 
   }
 }
 
+// Adjoint of average_row: writes `factor` rows of gradients.
 template <class Real>
 void spread_row(const Real* coarse, int width, int factor, Real* __restrict fine) {
   const int64_t pitch = int64_t(width) * factor;
@@ -172,7 +176,7 @@ int64_t first_non_finite(const Real* values, int64_t n) {
   constexpr int64_t kRun = 4096;
   for (int64_t begin = 0; begin < n; begin += kRun) {
     const int64_t end = std::min(n, begin + kRun);
-    Real sums[16] = {};  // each 0 unless it met a NaN or an infinity; sixteen, so that the compiler vectorises
+    Real sums[16] = {};  // 0 unless a term was NaN or infinite; sixteen, so that the compiler vectorises
     int64_t i = begin;
     for (; i + 16 <= end; i += 16)
       for (int l = 0; l < 16; ++l) sums[l] += values[i + l] * Real(0);
