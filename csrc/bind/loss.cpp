@@ -1,4 +1,4 @@
-// The loss of images and the steps of the optimiser.
+// Bindings of the image loss and of the optimiser's steps.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/vector.h>

@@ -1,4 +1,5 @@
-// The compiled module linprim_geo._core.
+// The compiled module linprim_geo._core: bindings of all parts, thread count, instruction set, speed limits,
+// statistics.
 #include <nanobind/stl/string.h>
 
 #include <string>

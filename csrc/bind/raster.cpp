@@ -1,4 +1,4 @@
-// The rasterizer, its gradients, the environment.
+// Bindings of the rasterizer, its gradients, level depth, pixel averaging and the environment light, per precision.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
@@ -25,6 +25,7 @@ namespace {
 // Ray model, order, screen filter.
 using RasterModel = std::tuple<int, int, double>;
 
+// Returns the view of checked arguments; throws std::invalid_argument.
 linprim::View make_view(const Pose& pose, const std::tuple<double, double, double, double>& intrinsics, int width,
                         int height, double near, double stop, double level, const RasterModel& model) {
   linprim::View view{};
@@ -48,6 +49,7 @@ linprim::View make_view(const Pose& pose, const std::tuple<double, double, doubl
   return view;
 }
 
+// Returns the primitives of arrays with checked shapes; throws std::invalid_argument.
 template <class Real>
 linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, const In<Real>& rotation,
                                           const In<Real>& extent, const In<Real>& density, const In<Real>& sh) {
@@ -68,7 +70,8 @@ linprim::Primitives<Real> make_primitives(int kind, const In<Real>& center, cons
           int(count)};
 }
 
-// A view's directions, whose size is that of `opacity` (H, W), and the cube map that it looks at.
+// Returns the camera as a direction view, with the image size of `opacity` (H, W), and the cube map `map` (6, S, S, 3);
+// checks both.
 template <class Real, class Map>
 std::pair<linprim::DirectionView, linprim::CubeMap<Real>> seen_directions(const std::array<double, 9>& rotation,
                                                                           const std::array<double, 4>& lens,
@@ -86,8 +89,8 @@ std::pair<linprim::DirectionView, linprim::CubeMap<Real>> seen_directions(const 
   return {view, {checked(map, {6, size, size, 3}, "the map"), int(size)}};
 }
 
-// Planes in the order rgb, opacity, depth_expected, depth_median, depth_first, distortion, normal, normal_median,
-// state.
+// Returns the image planes of arrays with checked shapes, in the order rgb, opacity, depth_expected, depth_median,
+// depth_first, distortion, normal, normal_median, state. Missing ones are null.
 template <class Real, class Array>
 linprim::Planes<Real> make_planes(const std::vector<std::optional<Array>>& arrays, int64_t height, int64_t width) {
   constexpr const char* kNames[] = {"rgb",        "opacity", "depth_expected", "depth_median", "depth_first",
@@ -103,6 +106,7 @@ linprim::Planes<Real> make_planes(const std::vector<std::optional<Array>>& array
   return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5], planes[6], planes[7], planes[8]};
 }
 
+// Throws if a required output plane is missing.
 template <class Real>
 void require_planes(const linprim::Planes<Real>& p, bool geometry) {
   bool all = p.rgb && p.opacity;
@@ -112,6 +116,7 @@ void require_planes(const linprim::Planes<Real>& p, bool geometry) {
   if (!all) throw std::invalid_argument("an output plane is missing");
 }
 
+// Throws if the primitives' kind does not support the view's blending order.
 template <class Real>
 void require_kernels(const linprim::View& view, const linprim::Primitives<Real>& primitives) {
   if (!linprim::has_kernels<Real>(primitives.kind, view.rays, view.order))
@@ -119,6 +124,7 @@ void require_kernels(const linprim::View& view, const linprim::Primitives<Real>&
         "these primitives cannot be blended in this order: a Gaussian has no entry and no exit");
 }
 
+// Defines the functions of one precision; `suffix` ends their names.
 template <class Real>
 void bind_real(nb::module_& m, const char* suffix) {
   using namespace nb::literals;

@@ -1,5 +1,5 @@
-// PatchMatch stereo, what supports its planes, surfaces fitted to them, planes of plain regions by their shading, and
-// votes of rays for tetrahedra.
+// Bindings of PatchMatch stereo, the support of its planes, surface fitting, plane fitting by shading in plain regions,
+// and votes of rays for tetrahedra.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -21,7 +21,7 @@
 #include "stereo/support.h"
 
 void bind_stereo(nb::module_& m) {
-  // `sources`: (to, shift, back, back_shift, quads, inverse depth or None) of each.
+  // One element of `sources`: (to, shift, back, back_shift, quads, inverse depth or None), see StereoSource.
   using Source = std::tuple<std::array<float, 9>, std::array<float, 3>, std::array<float, 9>, std::array<float, 3>,
                             In<uint32_t>, std::optional<In<float>>>;
   m.def("patch_match", [](In<uint8_t> grey, std::array<float, 4> lens, std::array<float, 2> range, float noise,

@@ -1,4 +1,4 @@
-// Points and voxels of surfaces: optical depth, photographs, votes.
+// Bindings of surface functions: optical depth, sampling of photographs, visibility, depth fusion, meshes.
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
@@ -37,7 +37,7 @@
 
 namespace {
 
-// A numpy array that has the values.
+// Moves the values into a numpy array that owns them.
 template <class T>
 nb::ndarray<nb::numpy, T, nb::ndim<1>> owned(std::vector<T>&& values) {
   auto* kept = new std::vector<T>(std::move(values));
@@ -46,12 +46,14 @@ nb::ndarray<nb::numpy, T, nb::ndim<1>> owned(std::vector<T>&& values) {
           })};
 }
 
+// Returns the coordinates of vectors one after another, (3 N,).
 std::vector<double> flat(const std::vector<linprim::Vector>& vectors) {
   std::vector<double> values(3 * vectors.size());
   for (size_t i = 0; i < vectors.size(); ++i) std::copy_n(vectors[i].data(), 3, values.data() + 3 * i);
   return values;
 }
 
+// Returns the view of a camera; `image` and `depth` may be null.
 linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& lens, int width, int height,
                               const float* image, int channels, const float* depth) {
   linprim::PhotoView view{{}, lens[0], lens[1], lens[2], lens[3], width, height, image, channels, depth};
@@ -59,6 +61,7 @@ linprim::PhotoView photo_view(const Pose& pose, const std::array<double, 4>& len
   return view;
 }
 
+// Defines the constructor of SolidTree for one precision.
 template <class Real>
 void bind_tree(nb::class_<linprim::SolidTree>& tree) {
   tree.def("__init__", [](linprim::SolidTree* self, int kind, In<Real> center, In<Real> rotation, In<Real> extent,
@@ -142,7 +145,7 @@ void bind_surface(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::least_footprints(view, least_cosine, at, along, count, out);
   });
-  // (2 Q,) places, (Q,) depths.
+  // Returns (2 Q,) pixel coordinates, (Q,) depths.
   m.def("visible_points",
         [](Pose pose, std::array<double, 4> lens, int width, int height, In<double> point, Out<uint8_t> inside) {
           const int64_t count = int64_t(inside.size());
@@ -184,7 +187,7 @@ void bind_surface(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::face_samples(view, faces, weights, int(samples), behind, slack, out);
   });
-  // (N,) how many points each body has, and the rows of them all, body by body.
+  // Returns (N,) the number of points in each body, and the rows of these points, body by body.
   m.def("points_within", [](In<double> center, In<double> normal, In<double> offset, In<double> point, double enlarged,
                             int64_t least) {
     if (normal.ndim() != 3) throw std::invalid_argument("normal has to have shape (N, F, 3)");
@@ -265,7 +268,7 @@ void bind_surface(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::add_votes(view, how, chosen, count, sums);
   });
-  // (3 V,) vertices and (3 F,) corners.
+  // Returns (3 V,) vertices and (3 F,) corners.
   m.def("marching_cubes", [](In<int64_t> index, In<int64_t> level, int resolution, In<float> distance,
                              In<uint8_t> known, In<uint8_t> mine) {
     const int64_t count = int64_t(level.size()), voxels = int64_t(resolution) * resolution * resolution;
@@ -302,7 +305,7 @@ void bind_surface(nb::module_& m) {
     nb::gil_scoped_release release;
     linprim::filter_normals({contrast, normal_rounds, vertex_rounds}, vertices, faces, corners, most, moved);
   });
-  // (2 N,) ends, (8 N,) planes, (N,) which cross a crease, and (N,) the length of edges around.
+  // Returns (2 N,) ends, (8 N,) planes, (N,) whether the edge crosses a crease, (N,) median length of the edges around.
   m.def("crease_edges", [](In<int64_t> corner, In<double> vertex, std::array<double, 9> rules) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
     const double* at = checked(vertex, {vertices, 3}, "vertex");
@@ -319,7 +322,7 @@ void bind_surface(nb::module_& m) {
     return std::tuple(owned(std::move(found.end)), owned(std::move(found.plane)), owned(std::move(found.crosses)),
                       owned(std::move(found.length)));
   });
-  // (3 V,) of vertices, (3 F,) of faces.
+  // Returns (3 V,) normals of vertices, (3 F,) normals of faces.
   m.def("normals", [](In<int64_t> corner, In<double> vertex) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
     const double* at = checked(vertex, {vertices, 3}, "vertex");
@@ -333,7 +336,7 @@ void bind_surface(nb::module_& m) {
     }
     return std::tuple(owned(std::move(of_vertices)), owned(std::move(of_faces)));
   });
-  // (N,) faces and (N,) numbers of edges.
+  // Returns (N,) pierced faces and (N,) rows of the edges that pierce them.
   m.def("crossings", [](In<int64_t> corner, In<double> vertex, In<int64_t> end) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0)), edges = int64_t(end.shape(0));
     const double* at = checked(vertex, {vertices, 3}, "vertex");
@@ -348,7 +351,7 @@ void bind_surface(nb::module_& m) {
     }
     return std::tuple(owned(std::move(found.face)), owned(std::move(found.edge)));
   });
-  // (3 V,) vertices, (3 F,) corners.
+  // Returns (3 V,) vertices, (3 F,) corners.
   m.def("simplify", [](In<int64_t> corner, In<double> vertex, In<double> tolerance) {
     const int64_t vertices = int64_t(vertex.shape(0)), faces = int64_t(corner.shape(0));
     const double* at = checked(vertex, {vertices, 3}, "vertex");
