@@ -12,14 +12,17 @@ namespace linprim {
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
-// A ray that has no more than this share of it in a cell only touches it: float64 rounds places by far less.
+// A ray with at most this share of its length in a cell only touches the cell. Rounding in float64 moves positions by
+// far less.
 constexpr double kTouching = 1e-9;
 
+// Traversal of the cells along rays from one point.
 class Walk {
  public:
   Walk(const Cells& mesh, int32_t start, int64_t* votes) : mesh_(mesh), start_(start), votes_(votes) {}
 
-  // The one of the cells around the start that a ray goes into: the faces at the start turn away from it.
+  // Returns the cell around the start that a ray enters. The outward normals of its three faces at the start point away
+  // from the ray; it is the cell whose largest product of these unit normals with the ray is least.
   int32_t first_cell(const Vector& ray, const int32_t* around, int64_t count) const {
     int32_t best = -1;
     double least = kInfinity;
@@ -35,6 +38,7 @@ class Walk {
     return best;
   }
 
+  // Follows a ray from cell to cell and casts its votes, as described at `vote_for_cells`.
   void along(const Vector& ray, int32_t cell, double empty, double full) const {
     const Vector center = point(start_);
     const double end = std::max(empty, full);
@@ -74,7 +78,7 @@ class Walk {
     return {at[0], at[1], at[2]};
   }
 
-  // A face of a cell: its normal, as long as twice its area, and a point of it.
+  // Returns a face of a cell: its outward normal, as long as twice its area, and a point of it.
   Face outward(int32_t cell, int face) const {
     const int32_t* corner = mesh_.corner + 4 * int64_t(cell);
     const Vector a = point(corner[(face + 1) % 4]), b = point(corner[(face + 2) % 4]);
@@ -84,7 +88,7 @@ class Walk {
     return {inward ? Vector{-normal[0], -normal[1], -normal[2]} : normal, a};
   }
 
-  // Sums of integers are the same in any order.
+  // Adds votes atomically: sums of integers are the same in any order.
   void vote(int64_t cell, int64_t count) const {
     std::atomic_ref<int64_t>(votes_[cell]).fetch_add(count, std::memory_order_relaxed);
   }

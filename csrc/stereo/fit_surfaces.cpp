@@ -12,7 +12,7 @@ void fit_surfaces(const uint8_t* grey, const float* plane, const float* cost, in
   const Crosses crosses(grey, height, width);
   const int64_t pixels = int64_t(height) * width;
   std::vector<float> inverse(plane, plane + pixels);
-  inverse.resize(pixels + kRoomAfter);
+  inverse.resize(pixels + kRoomAfter);  // kernels read whole vectors
   const SurfaceFit fit{crosses, height,    width,  inverse.data(), plane + pixels, plane + 2 * pixels,
                        cost,    tolerance, fitted, fitted_cost};
   const SurfaceFitKernel run = kernel_in_force<SurfaceFitKernel>(LINPRIM_COPIES(surface_fit_kernel));

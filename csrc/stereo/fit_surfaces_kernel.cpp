@@ -1,4 +1,4 @@
-// The surfaces around the pixels of one row; compiled once per instruction set.
+// Fits surfaces around the pixels of one row; compiled once per instruction set.
 #ifndef LINPRIM_ISA
 #error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
 #endif
@@ -15,24 +15,27 @@ namespace linprim {
 namespace LINPRIM_ISA {
 namespace {
 
+// Width of the square around a pixel; terms of a surface; rows of a cross between two checks of `count_on`.
 constexpr int kAcross = 2 * kCrossReach + 1, kTerms = 6, kRowsAtOnce = 2;
 static_assert(kWide <= kRoomAfter);
-// Powers of x and y of the terms of a surface of second order.
+// Powers of x and y in the terms of a second-order surface.
 constexpr int kX[kTerms] = {0, 1, 0, 2, 1, 0}, kY[kTerms] = {0, 0, 1, 0, 1, 2};
-// A term is dropped if earlier ones leave less than this share of its sum of squares: in two columns x * x equals x.
+// A term is dropped if elimination of the earlier terms leaves less than this share of its sum of squares: with only
+// two columns, x * x is linear in x.
 constexpr double kLeft = 1e-6;
 
-// Inverse depth around a pixel, by columns x and rows y from it.
+// Inverse depth around a pixel: coefficients of the terms in columns x and rows y from the pixel.
 struct Surface {
   float c[kTerms];
 };
 
-// How many pixels lie on a plane within the tolerance, and within 1/2, 1/4 and 1/8 of it.
+// Numbers of pixels that lie on a plane within the tolerance, and within 1/2, 1/4 and 1/8 of it.
 struct Counts {
   int on[kScales] = {};
   int sum() const { return std::accumulate(on, on + kScales, 0); }
 };
 
+// Returns the number of each lane.
 F lanes() {
   F numbers;
   for (int l = 0; l < kWide; ++l) numbers[l] = float(l);
@@ -41,26 +44,28 @@ F lanes() {
 
 F absolute(F values) { return values < F{} ? -values : values; }
 
+// Sums over the lanes.
 int total(I values) {
   int sum = 0;
   for (int l = 0; l < kWide; ++l) sum += values[l];
   return sum;
 }
 
-// The cross of the pixel at `at` in an image of inverse depths, after which kRoomAfter more may be read.
+// The cross of the pixel `at` in an image of inverse depths, behind which kRoomAfter more floats may be read.
 struct PixelCross {
   const Crosses& crosses;
   const float* inverse;
   int64_t at;
 
+  // Returns the number of pixels of the cross.
   int pixels() const {
     int all = 0;
     crosses.for_each_row(at, [&](int, int64_t, int left, int right) { all += left + right + 1; });
     return all;
   }
 
-  // How many of the `all` pixels lie on a plane, within the tolerance and 1/2, 1/4 and 1/8 of it. Not counted to the
-  // end where they cannot be more than `most` in all.
+  // Counts the pixels of the cross, `all` in number, that lie on a plane within the tolerance and within 1/2, 1/4 and
+  // 1/8 of it. Stops early once the sum of the four counts cannot exceed `most` any more.
   Counts count_on(const Surface& plane, float tolerance, int all, int most) const {
     I on[kScales] = {};
     int uncounted = all;
@@ -77,7 +82,7 @@ struct PixelCross {
         for (int k = 0; k < kScales; ++k) on[k] -= inside & (off < most_off * splat(1.0f / float(1 << k)));
       }
       uncounted -= left + right + 1;
-      // A few rows at a time, as it costs as much as a row.
+      // Checks only every kRowsAtOnce rows, as a check costs as much as a row.
       if (y % kRowsAtOnce == 0) enough = total(on[0] + on[1] + on[2] + on[3]) + kScales * uncounted > most;
     });
     Counts counts;
@@ -85,7 +90,7 @@ struct PixelCross {
     return counts;
   }
 
-  // The mean of another image over what lies on a plane.
+  // Returns the mean of another image over the pixels of the cross that lie on a plane.
   float mean_on(const Surface& plane, float tolerance, const float* image) const {
     double sum = 0;
     int count = 0;
@@ -99,12 +104,13 @@ struct PixelCross {
   }
 };
 
-// Sums over the pixels around one that lie on a surface, column by column: of powers of y, and of what they differ by
-// times these.
+// Sums over the pixels that lie on a surface, per column of the square around a pixel: of powers of y (`ones`), and of
+// residuals of inverse depth times powers of y (`differences`).
 struct Columns {
   float ones[5][kAcross + kWide] = {}, differences[3][kAcross + kWide] = {};
 };
 
+// Computes these sums for the square around the pixel `at`.
 Columns sums(const float* inverse, int height, int width, int64_t at, const Surface& surface, float tolerance) {
   Columns columns;
   const float* c = surface.c;
@@ -134,7 +140,8 @@ Columns sums(const float* inverse, int height, int width, int64_t at, const Surf
   return columns;
 }
 
-// Solves the normal equations, s[i][j] for j >= i and s[i][kTerms], by elimination.
+// Solves the normal equations by elimination. Their upper triangle is s[i][j] with j >= i, their right side
+// s[i][kTerms]; dropped terms get 0.
 void solve(double s[kTerms][kTerms + 1], double* solution) {
   constexpr int n = kTerms;
   double least[n];
@@ -156,7 +163,7 @@ void solve(double s[kTerms][kTerms + 1], double* solution) {
   }
 }
 
-// Moves a surface to the least squares of the pixels that lie on it. False if they are too few.
+// Fits a surface by least squares to the pixels that lie on it. Returns false if these are too few.
 bool improve(const Columns& columns, Surface& surface) {
   double ones[5][5] = {}, differences[3][3] = {};  // by powers of x, then y
   for (int k = 0; k < kAcross; ++k) {
@@ -177,6 +184,7 @@ bool improve(const Columns& columns, Surface& surface) {
   return true;
 }
 
+// Selects the plane of a pixel and fits its surface, as described at `fit_surfaces`.
 void fit_pixel(const SurfaceFit& fit, int64_t at) {
   const float tolerance = fit.tolerance;
   const int64_t pixels = int64_t(fit.height) * fit.width;

@@ -6,6 +6,7 @@
 namespace linprim {
 namespace {
 
+// Runs one step of the kernel for all rows, in parallel.
 void for_each_row(const PatchMatch& match, PatchMatchStep step, int number) {
   const PatchMatchKernel run = kernel_in_force<PatchMatchKernel>(LINPRIM_COPIES(patch_match_kernel));
   parallel_for(match.height, [&](int64_t row, int) { run(match, step, number, int(row)); });

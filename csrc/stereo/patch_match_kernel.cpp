@@ -1,4 +1,4 @@
-// The pixels of one row of PatchMatch, several at a time; compiled once per instruction set.
+// PatchMatch for the pixels of one row, one pixel per SIMD lane; compiled once per instruction set.
 #ifndef LINPRIM_ISA
 #error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
 #endif
@@ -14,26 +14,31 @@ namespace LINPRIM_ISA {
 namespace {
 
 constexpr int kSamples = kWindowSide * kWindowSide;
-// Bilateral weights of a window: standard deviations in pixels and in grey values. A sample farther in grey than
-// kFarGrey of these does not count. The next wider one is taken where samples like the pixel are less than kOwnShare of
-// the window or tell nothing.
+// Bilateral weights of a window: standard deviations in pixels (kNearPixels) and in grey values (kNearGrey). Samples
+// whose grey value differs by more than kFarGrey deviations have no weight. The next larger deviation in grey is used
+// where the samples have no more than kOwnShare of the spatial weights of the window, or too little texture.
 constexpr float kNearPixels = 5, kFarGrey = 2.5f, kOwnShare = 0.5f;
 constexpr int kGreys = 3;
 constexpr float kNearGrey[kGreys] = {10, 25, 60};
-// A window tells something if its variance is so many times the noise's: a right match then costs 0.2 at most.
+// A window has texture if its variance is above this multiple of the noise variance: a correct match then costs 0.2 at
+// most.
 constexpr float kInformed = 4;
-// A view whose cost is below kGood exp(-iteration^2 / kGoodFalls) agrees, one above kBad does not (ACMH).
+// View selection (ACMH): a cost below kGood exp(-iteration^2 / kGoodFalls) is a good match, one above kBad a bad match.
+// kCostSpread: standard deviation of the weight of good costs.
 constexpr float kGood = 0.8f, kGoodFalls = 90, kBad = 1.2f, kCostSpread = 0.3f;
+// Regions that give candidates for propagation; planes that are tried in refinement.
 constexpr int kRegions = 8, kRefinements = 5;
-// Perturbations: of the inverse depth as a share of itself and of its range, and of the normal.
+// Largest perturbations: of the inverse depth, relative to itself or to 5 % of its upper limit, whichever is larger,
+// and divided by iteration + 1; of each component of the unit normal.
 constexpr float kDepthStep = 0.02f, kNormalStep = 0.06f;
-// Weight of a pixel of error there and back, and the error above which it counts no more.
+// Geometric consistency: cost per pixel of forward-backward reprojection error, and the error in pixels at which it is
+// clamped.
 constexpr float kGeometryWeight = 0.1f, kGeometryMost = 4;
-constexpr float kWorst = 2;
-// The cosine between a plane's normal and the ray is at least this.
+constexpr float kWorst = 2;  // largest photometric cost, also of planes outside of a view
+// Least cosine between a plane's normal and the ray.
 constexpr float kFlattest = 0.12f;
 
-// Random numbers by place and purpose.
+// Hash of an integer. Random numbers are seeded by pixel and iteration.
 inline uint32_t mixed(uint32_t a) {
   a ^= a >> 16, a *= 0x7feb352du, a ^= a >> 15, a *= 0x846ca68bu, a ^= a >> 16;
   return a;
@@ -46,22 +51,24 @@ struct Random {
   }
 };
 
+// Plane hypotheses, one per lane: inverse depth and its slopes per column and per row.
 struct Planes {
   F w, x, y;
 };
 
-// The pixels that are looked at together: their places, windows and views.
+// A packet: pixels that are processed together, one per lane, with their reference windows and view weights.
 struct Packet {
   F column, row;
-  F weight[kSamples], centered[kSamples];  // of the reference's window: weights of sum 1; weights times (grey - mean)
-  F deviation;                             // root of the window's variance, noise included
+  F weight[kSamples], centered[kSamples];  // reference window: weights with sum 1; weights times (grey - mean)
+  F deviation;                             // standard deviation of the window, noise included
   F view[kMostSources];                    // weights of the views
-  int count;                               // lanes that are in the image
-  int at[kWide];                           // pixel
+  int count;                               // lanes in use; the others repeat the last of these
+  int at[kWide];                           // index of the pixel
 };
 
-// 1 - normalised cross correlation of the windows along planes. A window is so small that it is mapped by the
-// derivative at its middle.
+// Returns the photometric cost of planes in a view: 1 - normalised cross correlation (NCC) of the reference window and
+// the window that the plane maps it to, clamped to 0 to kWorst. Windows are small, so the plane's homography is
+// replaced by its derivative at the centre.
 inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {
   F p[3], dx[3], dy[3];
   for (int k = 0; k < 3; ++k) {
@@ -69,7 +76,7 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
     dx[k] = S.to[3 * k] + S.shift[k] * plane.x, dy[k] = S.to[3 * k + 1] + S.shift[k] * plane.y;
   }
   const F most_u = splat(float(S.width) - 1.001f), most_v = splat(float(S.height) - 1.001f), inverse = 1.0f / p[2];
-  // Outside of the photograph, or behind it.
+  // Lanes whose centre is outside of the photograph or behind its camera.
   const F u0 = p[0] * inverse, v0 = p[1] * inverse;
   const I bad = (p[2] <= 1e-6f) | (u0 < 0.0f) | (v0 < 0.0f) | (u0 > most_u) | (v0 > most_v);
   bool none = true;
@@ -102,7 +109,9 @@ inline F photo_cost(const PatchMatch& M, const StereoSource& S, const Packet& P,
   return bad ? splat(kWorst) : vmin(vmax(cost, F{}), splat(kWorst));
 }
 
-// Pixels between a pixel and where it comes back to from the surface that the source has there.
+// Returns the geometric cost of planes in a view: the forward-backward reprojection error in pixels, weighted and
+// clamped. Forward, the pixel is mapped along its plane into the view; back, along the depth that the view has there.
+// Without such a depth the cost is the largest.
 inline F geometry_cost(const StereoSource& S, const Packet& P, const Planes& plane) {
   F p[3], q[3];
   for (int k = 0; k < 3; ++k)
@@ -121,19 +130,21 @@ inline F geometry_cost(const StereoSource& S, const Packet& P, const Planes& pla
   return kGeometryWeight * ((w >= 0.0f) & (q[2] > 1e-6f) ? error : splat(kGeometryMost));
 }
 
+// Returns the matching cost of planes in a view: photometric, plus geometric if the view has depths.
 inline F view_cost(const PatchMatch& M, const StereoSource& S, const Packet& P, const Planes& plane) {
   const F cost = photo_cost(M, S, P, plane);
   return S.inverse_depth ? cost + geometry_cost(S, P, plane) : cost;
 }
 
-// Weighted mean of the views' costs.
+// Returns the mean of the views' costs, weighted by P.view.
 inline F joint_cost(const PatchMatch& M, const Packet& P, const F* cost) {
   F sum{}, total{};
   for (int v = 0; v < M.sources; ++v) sum += P.view[v] * cost[v], total += P.view[v];
   return sum / vmax(total, splat(1e-12f));
 }
 
-// Unit normals of planes, and the direction of the rays; towards the camera z is negative.
+// Computes the unit normal of a plane. It points away from the camera (n . ray > 0 for w > 0); (0, 0, 1) for the plane
+// at infinity.
 inline void normal_of(const PatchMatch& M, float column, float row, float w, float x, float y, float normal[3]) {
   // n is parallel to (w_x f_x, w_y f_y, w - w_x (column - c_x) - w_y (row - c_y)): n . X = 1 for w = n . ray.
   const float n[3] = {x * M.focal_x, y * M.focal_y, w - x * (column - M.center_x) - y * (row - M.center_y)};
@@ -141,7 +152,8 @@ inline void normal_of(const PatchMatch& M, float column, float row, float w, flo
   for (int k = 0; k < 3; ++k) normal[k] = length > 0 ? n[k] / length : float(k == 2);
 }
 
-// The plane at a pixel with inverse depth w and this normal, which is turned where it is too flat to be seen.
+// Computes the plane at a pixel with inverse depth w and this normal. A normal with a cosine to the ray below kFlattest
+// is turned until it has that cosine.
 inline void plane_of(const PatchMatch& M, float column, float row, float w, const float normal[3], float plane[3]) {
   const float ray[3] = {(column - M.center_x) / M.focal_x, (row - M.center_y) / M.focal_y, 1};
   const float length = std::sqrt(ray[0] * ray[0] + ray[1] * ray[1] + 1);
@@ -159,6 +171,7 @@ inline void plane_of(const PatchMatch& M, float column, float row, float w, cons
   plane[0] = w, plane[1] = scale * n[0] / M.focal_x, plane[2] = scale * n[1] / M.focal_y;
 }
 
+// Draws a unit vector uniformly by rejection sampling.
 inline void random_normal(Random& random, float n[3]) {
   float square;
   do {
@@ -169,11 +182,12 @@ inline void random_normal(Random& random, float n[3]) {
   for (int k = 0; k < 3; ++k) n[k] /= length;
 }
 
+// Stores the plane of a lane.
 inline void put(Planes& planes, int lane, const float plane[3]) {
   planes.w[lane] = plane[0], planes.x[lane] = plane[1], planes.y[lane] = plane[2];
 }
 
-// Variance of the grey values of 3 by 3 pixels.
+// Returns the variance of the grey values of the 3x3 pixels around a pixel.
 inline float local_variance(const PatchMatch& M, int column, int row) {
   float sum = 0, square = 0, n = 0;
   for (int y = std::max(row - 1, 0); y <= std::min(row + 1, M.height - 1); ++y)
@@ -184,8 +198,9 @@ inline float local_variance(const PatchMatch& M, int column, int row) {
   return square / n - sum / n * (sum / n);
 }
 
-// The samples of a window: their places, odd numbers of pixels from the middle, their weights by distance with the sum
-// of these, and by difference of grey values.
+// Tables for the samples of a window: their offsets from the centre, which are odd numbers of pixels; their spatial
+// weights `near` and the sum of these; and weights `falls` by absolute difference of grey values, for each deviation in
+// kNearGrey.
 struct WindowTables {
   int down[kSamples], right[kSamples];
   float near[kSamples], all_near = 0, falls[kGreys][256];
@@ -205,8 +220,10 @@ struct WindowTables {
   }
 };
 
-// Weights of the reference's window: samples of the pixel's own grey, and others where these do not suffice and an edge
-// runs through the pixel itself. Beside an edge a plain pixel keeps to itself: it may lie on what is behind.
+// Computes the weights of the reference windows. Samples similar in grey to the pixel are preferred. A larger deviation
+// in grey is used if these samples do not suffice and the 3x3 pixels around the pixel have texture, so that an edge
+// runs through the pixel itself. A plain pixel beside an edge keeps the smallest deviation with which any sample has
+// weight, because it may belong to the surface behind the edge.
 inline void look(const PatchMatch& M, Packet& P) {
   static const WindowTables tables;
   for (int l = 0; l < kWide; ++l) {
@@ -227,7 +244,7 @@ inline void look(const PatchMatch& M, Packet& P) {
         weight[k] = tables.falls[s][std::abs(grey[k] - middle)] * tables.near[k];
         total += weight[k], mean += weight[k] * float(grey[k]);
       }
-      if (!(total > 0)) continue;  // no sample is like the pixel
+      if (!(total > 0)) continue;  // no sample is similar to the pixel
       mean /= total;
       for (int k = 0; k < kSamples; ++k) {
         const float difference = float(grey[k]) - mean;
@@ -244,13 +261,15 @@ inline void look(const PatchMatch& M, Packet& P) {
   }
 }
 
-// Sorts the costs of views and says how many are the better half of those that show the point, 1 at least.
+// Sorts the costs of the views. Returns the size of the better half of the views that see the point (cost below
+// kWorst), at least 1.
 inline int better_half(float* cost, int views) {
   std::sort(cost, cost + views);
   const int seen = int(std::lower_bound(cost, cost + views, kWorst) - cost);
   return std::max(1, (seen + 1) / 2);
 }
 
+// Initialises a packet: random planes where none are given, costs and chosen views.
 void begin(const PatchMatch& M, Packet& P) {
   Planes planes{};
   for (int l = 0; l < kWide; ++l) {
@@ -265,7 +284,7 @@ void begin(const PatchMatch& M, Packet& P) {
     }
     put(planes, l, plane);
   }
-  // The mean of the better half of the views.
+  // The cost is the mean over the better half of the views, which are chosen.
   F cost[kMostSources];
   for (int v = 0; v < M.sources; ++v) cost[v] = view_cost(M, M.source[v], P, planes);
   for (int l = 0; l < P.count; ++l) {
@@ -281,9 +300,10 @@ void begin(const PatchMatch& M, Packet& P) {
   }
 }
 
-// Of each region round a pixel the plane of the least cost, taken to the pixel. All places have the other colour.
+// Finds the candidates for propagation: from each region around a pixel the plane with the least cost, extrapolated to
+// the pixel. All positions of a region have the other colour of the red-black pattern.
 inline void candidates(const PatchMatch& M, const Packet& P, Planes* found) {
-  // Near regions: a V of 7 pixels in each direction; far ones: 11 pixels along it.
+  // Regions 0 to 3 (near): a V of 7 pixels in each direction. Regions 4 to 7 (far): 11 pixels along each direction.
   static constexpr int direction[4][2] = {{0, -1}, {0, 1}, {-1, 0}, {1, 0}};
   for (int l = 0; l < kWide; ++l) {
     const int column = int(P.column[l]), row = int(P.row[l]);
@@ -300,7 +320,7 @@ inline void candidates(const PatchMatch& M, const Packet& P, Planes* found) {
         offer(column + dx, row + dy);
         for (int i = 1; i <= 3; ++i)
           for (int side = -1; side <= 1; side += 2) {
-            // Along the direction 1 + i, aside i: the sum is odd.
+            // 1 + i along the direction and i aside: the sum is odd, so the pixel has the other colour.
             offer(column + dx * (1 + i) + dy * side * i, row + dy * (1 + i) + dx * side * i);
           }
       } else {
@@ -316,7 +336,8 @@ inline void candidates(const PatchMatch& M, const Packet& P, Planes* found) {
   }
 }
 
-// Weights of the views from what they say of the candidates.
+// Computes the weights of the views from their costs for the candidates. A view has weight if it has more than two good
+// and fewer than three bad matches: the mean weight of its good costs times a prior.
 inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSources], int number) {
   const float good = kGood * std::exp(-float(number * number) / kGoodFalls);
   for (int l = 0; l < kWide; ++l) {
@@ -331,7 +352,7 @@ inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSo
         if (c > kBad) ++contradict;
       }
       weight[v] = agree > 2 && contradict < 3 ? sum / float(agree) : 0;
-      // Neighbours that chose it.
+      // Prior: higher for each of the four neighbours that chose the view.
       float prior = 0.1f;
       if (column > 0) prior += 0.225f * float(M.chosen[P.at[l] - 1] >> v & 1);
       if (column + 1 < M.width) prior += 0.225f * float(M.chosen[P.at[l] + 1] >> v & 1);
@@ -339,7 +360,7 @@ inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSo
       if (row + 1 < M.height) prior += 0.225f * float(M.chosen[P.at[l] + M.width] >> v & 1);
       weight[v] *= prior, total += weight[v];
     }
-    if (!(total > 0)) {  // None agrees: the better half by their least cost.
+    if (!(total > 0)) {  // No view has weight: the better half by least cost.
       float least[kMostSources], sorted[kMostSources];
       for (int v = 0; v < M.sources; ++v) {
         least[v] = kWorst * 2;
@@ -353,6 +374,7 @@ inline void choose_views(const PatchMatch& M, Packet& P, const F (*cost)[kMostSo
   }
 }
 
+// Performs one iteration for a packet: propagation, view selection, refinement.
 void iterate(const PatchMatch& M, Packet& P, int number) {
   Planes found[kRegions], current{};
   candidates(M, P, found);
@@ -369,7 +391,8 @@ void iterate(const PatchMatch& M, Packet& P, int number) {
     current.x = better ? planes.x : current.x, current.y = better ? planes.y : current.y;
   };
   for (int region = 0; region < kRegions; ++region) take(found[region], joint_cost(M, P, cost[region]));
-  // (d', n), (d, n'), (d', n'), (random d, n), (d, random n), as they are at first.
+  // Refinement tries planes of inverse depth d and normal n, perturbed where marked ': (d', n), (d, n'), (d', n'),
+  // (random d, n), (d, random n). d and n are those before refinement.
   const Planes old = current;
   Planes tried[kRefinements];
   const float smaller = 1 / float(1 + number);
@@ -406,6 +429,7 @@ void iterate(const PatchMatch& M, Packet& P, int number) {
   }
 }
 
+// Processes the pixels of one row, packet by packet.
 void row_of(const PatchMatch& M, PatchMatchStep step, int number, int row) {
   const int stride = step == PatchMatchStep::kBegin ? 1 : 2;
   const int first = step == PatchMatchStep::kBegin ? 0 : (row + (step == PatchMatchStep::kOdd)) % 2;

@@ -8,12 +8,14 @@
 namespace linprim {
 namespace {
 
-// The range of gains; rounds in which differences beyond two deviations lose weight.
+// Range of gains; rounds of reweighted least squares, in which residuals beyond two standard deviations lose weight.
 constexpr double kLeastGain = 0.7, kMostGain = 1.4;
 constexpr int kRounds = 3;
-// Deviations of a normal distribution per median of its size, and what is added to a deviation, in grey levels.
+// Standard deviation of a normal distribution per median absolute deviation; constant added to a deviation, in grey
+// levels.
 constexpr double kPerMedian = 1.4826, kLeastDeviation = 0.05;
-// Variances, in grey levels squared, below which values count as equal.
+// Bounds against division by zero, in powers of grey levels: least sum of squares; constant added to the variance of
+// residuals; least standard deviation of values.
 constexpr double kFlat = 1e-6, kLeastVariance = 1e-4, kLeastSpread = 1e-3;
 
 double dot(const std::vector<double>& a, const std::vector<double>& b) {
@@ -35,14 +37,16 @@ double variance(const std::vector<double>& a) {
   return sum / double(a.size());
 }
 
-// What is known of one box that both photographs show.
+// The boxes that both photographs show, one entry per box.
 struct Boxes {
-  std::vector<int64_t> index;
-  std::vector<double> ours, theirs;  // values
-  std::vector<double> slope;         // of theirs by inverse depth, of a gain of 1
-  std::vector<double> gain, left, weight;
+  std::vector<int64_t> index;              // row in the ShadedPair
+  std::vector<double> ours, theirs;        // mean grey values
+  std::vector<double> slope;               // derivative of theirs by inverse depth, for a gain of 1
+  std::vector<double> gain, left, weight;  // by match(): derivative of ours by theirs, residual, Huber weight
 };
 
+// Projects the boxes along the plane into the other photograph. Keeps those that lie inside of it and have no edge
+// there.
 Boxes boxes_of_both(const ShadedPair& pair) {
   Boxes found;
   for (int64_t k = 0; k < pair.boxes; ++k) {
@@ -74,8 +78,8 @@ Boxes boxes_of_both(const ShadedPair& pair) {
   return found;
 }
 
-// An offset, a gain within its range, and a bend of the gain, which a tone curve has where exposures differ, by least
-// squares with Huber's weights.
+// Fits ours as a function of theirs: an offset, a gain within its range, and a bend of the gain (a quadratic term),
+// which a tone curve causes where exposures differ. Least squares with Huber's weights.
 void match(Boxes& boxes) {
   const size_t count = boxes.index.size();
   std::vector<double> a(count), b(count), square(count), size(count);
@@ -110,7 +114,7 @@ void match(Boxes& boxes) {
   }
 }
 
-// Takes out of `values` what `base` of unit length explains.
+// Subtracts from `values` their projection onto `base`, which has unit length or is 0.
 void take_out(std::vector<double>& values, const std::vector<double>& base) {
   const double along = dot(values, base);
   for (size_t k = 0; k < values.size(); ++k) values[k] -= along * base[k];
@@ -132,7 +136,8 @@ ShadedComparison compare_shading(const ShadedPair& pair, uint8_t* shown, double*
   for (size_t k = 0; k < count; ++k) result.left_variance += boxes.weight[k] * boxes.left[k] * boxes.left[k];
   result.left_variance = result.left_variance / double(count) + kLeastVariance;
 
-  // Slopes by each parameter, less what offset, gain and its bend take.
+  // Weighted derivatives of the fitted values by each parameter (`slope`), made orthogonal to the terms of offset, gain
+  // and bend (`taken`), which are thereby eliminated.
   std::vector<double> root(count);
   for (size_t k = 0; k < count; ++k) root[k] = std::sqrt(boxes.weight[k]);
   const double middle = mean(boxes.theirs), spread = std::max(std::sqrt(variance(boxes.theirs)), kLeastSpread);
@@ -149,11 +154,11 @@ ShadedComparison compare_shading(const ShadedPair& pair, uint8_t* shown, double*
   }
   for (int a = 0; a < 3; ++a) {
     const double before = std::sqrt(dot(taken[a], taken[a]));
-    // Twice: once leaves a rest of rounding that is not orthogonal.
+    // Gram-Schmidt twice: after one pass, rounding leaves a part that is not orthogonal.
     for (int turn = 0; turn < 2; ++turn)
       for (int b = 0; b < a; ++b) take_out(taken[a], taken[b]);
     const double length = std::sqrt(dot(taken[a], taken[a]));
-    const double scale = length > 1e-10 * before ? 1 / length : 0;  // values that do not differ have nothing to take
+    const double scale = length > 1e-10 * before ? 1 / length : 0;  // 0 if it depends on earlier terms: equal values
     for (double& x : taken[a]) x *= scale;
   }
   for (std::vector<double>& one : slope)

@@ -17,6 +17,7 @@ void support(const uint8_t* grey, const float* plane, int height, int width, flo
     crosses.for_each_row(at, [&](int y, int64_t middle, int left, int right) {
       for (int x = -left; x <= right; ++x) {
         const int64_t other = middle + x;
+        // Inverse depth of this pixel's plane at the other pixel, and of the other pixel's plane here.
         const float here = plane[at] + right_slope[at] * float(x) + down_slope[at] * float(y);
         const float back = plane[other] - right_slope[other] * float(x) - down_slope[other] * float(y);
         const bool continues = std::abs(plane[other] - here) < tolerance * here;
