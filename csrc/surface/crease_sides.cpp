@@ -10,19 +10,21 @@
 namespace linprim {
 namespace {
 
+// Largest number of sides around an edge; least number of faces of a side; rounds of assigning faces to sides.
 constexpr int kMostSides = 6, kLeastFaces = 3, kSideRounds = 3;
 constexpr int64_t kEdgesPerTask = 512;
-// Squared sine below which two planes are too near to parallel to have a line.
+// Squared sine of the angle between two planes below which they are too close to parallel to intersect in a line.
 constexpr double kLeastSine = 0.05;
-// What rounding may change of a squared distance of normals.
+// Relative bound on what rounding changes in a squared distance between normals.
 constexpr double kRounding = 1e-9;
 
-// A list of rows for each of many.
+// A list of row numbers for each of many elements.
 struct Lists {
   std::vector<int64_t> first, end;
   std::vector<int32_t> row;
 
-  // Of each of `count` what fill(i, next) writes to `next`, most(i) at most, each once and in order.
+  // Makes the lists of `count` elements. fill(i, next) writes the rows of element i from `next` on, at most most(i),
+  // and returns their end. Lists are sorted and without duplicates.
   template <class Most, class Fill>
   void make(int64_t count, const Most& most, const Fill& fill) {
     first.resize(count), end.resize(count);
@@ -37,35 +39,39 @@ struct Lists {
     });
   }
 
-  // Calls body(row) for those of i.
+  // Calls body(row) for each row in the list of element i.
   template <class Body>
   void each(int64_t i, const Body& body) const {
     for (int64_t k = first[i]; k < end[i]; ++k) body(int64_t(row[k]));
   }
 };
 
+// The mesh, with data per face and per vertex that all edges share.
 struct Mesh {
   const FaceFans& fans;
   const double* vertex;
   FaceNormals faces;
-  std::vector<Vector> averaged, middle;
-  std::vector<uint8_t> flat, inner;  // inner: so are all around it
-  std::vector<double> edge;          // the second longest
-  Lists joined;  // of a face the inner ones before it that share a vertex with it and have normals as near as a side's
-  Lists beside;  // of a vertex those that it shares an edge with
-  Lists inside;  // of a vertex the inner faces around it
+  std::vector<Vector> averaged, middle;  // averaged normals; centroids
+  std::vector<uint8_t> flat, inner;      // inner: the face and all around it are flat
+  std::vector<double> edge;              // length of the second longest edge
+  // Per inner face: the inner faces with lower numbers that share a vertex with it and whose averaged normals have a
+  // cosine of at least `flat` to its own.
+  Lists joined;
+  Lists beside;  // per vertex: the vertices that it shares an edge with
+  Lists inside;  // per vertex: the inner faces around it
 
   Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
 };
 
+// A side: its plane has the weighted mean normal of its faces and goes through their weighted mean centroid.
 struct Side {
-  int part;  // of the faces that hang together
+  int part;  // connected component of its faces
   Vector normal, middle;
   double weight = 0;
   int faces = 0;
 };
 
-// The second longest edge of a face.
+// Returns the length of the second longest edge of a face.
 double middle_edge(const Mesh& mesh, int64_t face) {
   const int64_t* corner = mesh.fans.corner + 3 * face;
   double length[3];
@@ -76,6 +82,7 @@ double middle_edge(const Mesh& mesh, int64_t face) {
   return std::max(std::min(length[0], length[1]), std::min(std::max(length[0], length[1]), length[2]));
 }
 
+// Fills the lists of the mesh.
 void find_lists(const CreaseRules& how, Mesh& mesh) {
   const FaceFans& fans = mesh.fans;
   const auto around = [&](int64_t v) { return fans.first[v + 1] - fans.first[v]; };
@@ -109,6 +116,7 @@ void find_lists(const CreaseRules& how, Mesh& mesh) {
   });
 }
 
+// Computes the data of the mesh that all edges share.
 Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex) {
   Mesh mesh{fans, vertex, face_normals(fans, vertex), {}, {}, {}, {}, {}, {}, {}, {}};
   mesh.averaged = average_normals(fans, mesh.faces, how.contrast, how.normal_rounds);
@@ -132,7 +140,7 @@ Mesh prepared(const CreaseRules& how, const FaceFans& fans, const double* vertex
   return mesh;
 }
 
-// Between which values the coordinates of some normals are.
+// Axis-aligned bounding box of normals.
 struct Box {
   Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
 
@@ -144,7 +152,7 @@ struct Box {
   }
 };
 
-// Of each vertex the box of the averaged normals of all inner faces within the rings around it.
+// Returns for each vertex the bounding box of the averaged normals of all inner faces within `rings` rings around it.
 std::vector<Box> boxes_of_normals(const CreaseRules& how, const Mesh& mesh) {
   std::vector<Box> box(mesh.fans.vertices), wider(mesh.fans.vertices);
   for_rows(mesh.fans.vertices, [&](int64_t v) {
@@ -160,21 +168,22 @@ std::vector<Box> boxes_of_normals(const CreaseRules& how, const Mesh& mesh) {
   return box;
 }
 
-// Whether two of the normals in a box may be of sides that meet at a crease: none of unit vectors in it, and so none of
-// their means, differ by more than it is wide.
+// Returns whether sides with normals in a box may meet at a crease. Unit vectors in the box, and so their means, differ
+// by no more than its diagonal.
 bool may_differ(const CreaseRules& how, const Box& box) {
   const Vector wide = minus(box.high, box.low);
   return box.low[0] <= box.high[0] && dot(wide, wide) >= (1 - kRounding) * (2 - 2 * how.crease);
 }
 
-// What lies around one edge after the other; one of these per thread.
+// Tests one edge after the other for sides around it. Each thread has an instance with its own scratch memory.
 class Around {
  public:
   Around(const CreaseRules& how, const Mesh& mesh)
       : how_(how), mesh_(mesh), place_(mesh.fans.faces), reached_(mesh.fans.vertices) {}
 
-  // False where an end has no side. Else the planes of the ends, whether they meet at a crease, and how long edges
-  // around are.
+  // Writes the planes of the sides of an edge's ends, whether the two sides meet at a crease, and the median length of
+  // the edges around. Returns false if an end has no side, if the normals of a side are not even, or if the ends lie on
+  // different sides that do not make a crease.
   bool ask(const int64_t* ends, double* plane, uint8_t& crosses, double& length) {
     if (!gather(ends)) return false;
     measure();
@@ -194,7 +203,8 @@ class Around {
   }
 
  private:
-  // The inner faces within the rings, and which of them hang together. False if they are too few for a side.
+  // Collects the inner faces within the rings around the edge, and their connected components by union-find. Returns
+  // false if they are too few for a side.
   bool gather(const int64_t* ends) {
     ++now_;
     vertices_.clear(), faces_.clear(), parent_.clear();
@@ -225,7 +235,7 @@ class Around {
     return true;
   }
 
-  // The length of edges around.
+  // Computes the median of the second longest edges of the faces around.
   void measure() {
     lengths_.clear();
     for (const int64_t v : vertices_)
@@ -239,12 +249,15 @@ class Around {
     length_ = *middle;
   }
 
+  // Returns the root of a face in the union-find forest.
   int root(int i) {
     while (parent_[i] != i) i = parent_[i] = parent_[parent_[i]];
     return i;
   }
 
-  // The parts that hang together, split where normals differ. False if there are too many.
+  // Splits the connected components into sides where normals differ. Each side starts from the face with the most
+  // weight that no side has claimed; then rounds assign every face to the side of its component with the nearest
+  // normal, and average. Returns false if there are too many sides.
   bool find_sides() {
     const int count = int(faces_.size());
     weight_.resize(count), side_.resize(count), claimed_.assign(count, 0);
@@ -283,7 +296,7 @@ class Around {
     return true;
   }
 
-  // The face with the most weight, the first of several, that no side has claimed; -1 if there is none.
+  // Returns the face with the most weight that no side has claimed, the first of equal ones; -1 if there is none.
   int heaviest() const {
     int best = -1;
     for (int i = 0; i < int(weight_.size()); ++i)
@@ -291,6 +304,7 @@ class Around {
     return best;
   }
 
+  // Returns the side with the nearest plane to a point, of those with enough faces; null if there is none.
   const Side* nearest(const Vector& point) const {
     const Side* best = nullptr;
     double least = INFINITY;
@@ -301,6 +315,7 @@ class Around {
     return best;
   }
 
+  // Returns whether the mean cosine between the normals of a side's faces and its own is at least `even`.
   bool even(const Side& side) const {
     double mean = 0;
     for (size_t i = 0; i < faces_.size(); ++i)
@@ -308,6 +323,7 @@ class Around {
     return mean >= how_.even * side.weight;
   }
 
+  // Returns whether the normals of two sides differ enough for a crease, both in the mean and extrapolated to the edge.
   bool make_crease(const Side& a, const Side& b) const {
     const double cosine = dot(a.normal, b.normal);
     if (cosine > how_.crease || 1 - cosine * cosine < kLeastSine) return false;
@@ -315,7 +331,8 @@ class Around {
     return goes_on(a, one) && goes_on(b, other) && dot(one, other) <= how_.crease;
   }
 
-  // The normal of a side where the edge is, by a linear fit to those of the mesh. False if the side is not wide.
+  // Extrapolates the normal of a side to the edge, by a linear fit to the mesh's own face normals. Returns false if the
+  // side is not wide enough.
   bool goes_on(const Side& side, Vector& normal) const {
     Vector across = minus(here_, side.middle);
     add(across, -dot(across, side.normal), side.normal);
@@ -341,13 +358,13 @@ class Around {
   struct Place {
     int reached = 0, row = 0, measured = 0;
   };
-  // Of each face of the mesh when it was reached last, its row in `faces_` then, and when it was measured; of each
-  // vertex when it was reached.
+  // Per face of the mesh: the test (`now_`) in which it was last reached, its row in `faces_` then, and the test in
+  // which it was last measured. Per vertex: the test in which it was last reached.
   std::vector<Place> place_;
   std::vector<int> reached_;
   int now_ = 0;
   std::vector<int64_t> vertices_, faces_;
-  std::vector<int> parent_, part_, side_;  // per row of `faces_`, as are the next two
+  std::vector<int> parent_, part_, side_;  // per row of `faces_`, as are `claimed_` and `weight_`
   std::vector<uint8_t> claimed_;
   std::vector<double> weight_, lengths_;
   double length_ = 0;
@@ -357,7 +374,7 @@ class Around {
 
 using Ends = std::array<int64_t, 2>;
 
-// The edges of faces that are not flat, each once and in order.
+// Returns the edges of faces that are not flat, each once, sorted.
 std::vector<Ends> edges_to_ask(const Mesh& mesh) {
   std::vector<Ends> edges;
   for (int64_t f = 0; f < mesh.fans.faces; ++f)
@@ -370,7 +387,7 @@ std::vector<Ends> edges_to_ask(const Mesh& mesh) {
   return edges;
 }
 
-// What is known of each of some edges.
+// Results of the tests, one entry per edge; `known`: both ends lie on known sides.
 struct Answers {
   std::vector<std::array<double, 8>> plane;
   std::vector<uint8_t> known, crosses, asked;
@@ -379,7 +396,7 @@ struct Answers {
   explicit Answers(size_t count) : plane(count), known(count), crosses(count), asked(count), length(count) {}
 };
 
-// The vertices of faces of which a vertex is the end of an edge across a crease.
+// Marks the vertices of all faces that touch an end of an edge across a crease.
 std::vector<uint8_t> beside_creases(const Mesh& mesh, const std::vector<Ends>& edges, const Answers& answers) {
   std::vector<uint8_t> end(mesh.fans.vertices), beside(mesh.fans.vertices);
   for (size_t e = 0; e < edges.size(); ++e)
@@ -401,6 +418,7 @@ CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces
   const int64_t count = int64_t(edges.size());
   Answers answers(edges.size());
   std::vector<std::unique_ptr<Around>> around(threads());
+  // Tests the edges for which wanted(ends) is true and which were not tested before.
   const auto ask_where = [&](const auto& wanted) {
     parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
       if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);

@@ -1,5 +1,6 @@
-// Boxes around the faces, halved along the longest side of their middles; an edge goes down those that its box touches.
-// Faces that are near none of few edges have no part in it.
+// Bounding volume hierarchy (BVH) of the faces' boxes, split at the median along the longest side of the box of their
+// middles. An edge descends into the nodes that its box touches. If there are few edges, faces near none of them are
+// left out.
 #include "surface/crossings.h"
 
 #include <algorithm>
@@ -13,10 +14,11 @@ namespace linprim {
 namespace {
 
 constexpr int64_t kLeaf = 4;     // boxes in a leaf at most
-constexpr int kLevelsApart = 4;  // levels below which parts of the tree are built at the same time
+constexpr int kLevelsApart = 4;  // levels of the tree below which subtrees are built in parallel
 constexpr int64_t kEdgesPerTask = 4096;
-constexpr int64_t kFew = 8;  // edges are few if there are so many times as many faces
+constexpr int64_t kFew = 8;  // edges are few if there are at least this many times as many faces
 
+// Axis-aligned bounding box.
 struct Box {
   Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
 
@@ -31,19 +33,20 @@ struct Box {
   }
 };
 
-// Boxes of the order.
+// The boxes begin .. end - 1 of `BoxTree::order`.
 struct Range {
   int64_t begin, end;
 };
 
-// The boxes begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that
-// is not below it: a leaf.
+// A node with the boxes begin .. end - 1 of `BoxTree::order`. Nodes are in depth-first order: the first child of a node
+// is the next node, and `after` is the next node that is not below it. A leaf has no node between itself and `after`.
 struct Node {
   Box box;
   int64_t begin, end;
   size_t after;
 };
 
+// BVH of boxes. Its upper levels are built on one thread, the subtrees below in parallel.
 struct BoxTree {
   const std::vector<Box>& boxes;
   std::vector<int64_t> order;
@@ -61,7 +64,7 @@ struct BoxTree {
     join(all, kLevelsApart, below, next);
   }
 
-  // Calls body(i) for boxes near `box`, until it is true; whether it was.
+  // Calls body(i) for the boxes in leaves that `box` touches, until body returns true. Returns whether it did.
   template <class Body>
   bool any(const Box& box, const Body& body) const {
     for (size_t n = 0; n < nodes.size();) {
@@ -78,9 +81,10 @@ struct BoxTree {
   }
 
  private:
+  // Returns twice the middle of a box along an axis.
   double middle(int64_t i, int axis) const { return boxes[i].low[axis] + boxes[i].high[axis]; }
 
-  // Puts the boxes of a range in two halves, and gives where the second begins.
+  // Partitions a range at the median of the middles. Returns the beginning of the second half.
   int64_t halved(Range range) {
     Vector low{INFINITY, INFINITY, INFINITY}, high{-INFINITY, -INFINITY, -INFINITY};
     for (int64_t i = range.begin; i < range.end; ++i)
@@ -97,7 +101,7 @@ struct BoxTree {
     return half;
   }
 
-  // The ranges that are built each on its own, so many levels below.
+  // Collects the ranges `levels` levels below, whose subtrees are built separately.
   void divide(Range range, int levels, std::vector<Range>& parts) {
     if (levels == 0 || range.end - range.begin <= kLeaf) return parts.push_back(range);
     const int64_t half = halved(range);
@@ -105,7 +109,7 @@ struct BoxTree {
     divide({half, range.end}, levels - 1, parts);
   }
 
-  // Puts what was built on its own in its place in the tree, from the part `next` on.
+  // Assembles the tree of a range from its upper `levels` levels and the subtrees `below`, from subtree `next` on.
   void join(Range range, int levels, const std::vector<std::vector<Node>>& below, size_t& next) {
     const size_t first = nodes.size();
     if (levels == 0 || range.end - range.begin <= kLeaf) {
@@ -120,6 +124,7 @@ struct BoxTree {
     close(nodes, first, second);
   }
 
+  // Appends the subtree of a range to `into`.
   void build(Range range, std::vector<Node>& into) {
     const size_t first = into.size();
     into.push_back({{}, range.begin, range.end, first + 1});
@@ -134,21 +139,23 @@ struct BoxTree {
     close(into, first, second);
   }
 
-  // Gives a node, whose children are the next one and `second`, their box; they are the end of `tree`.
+  // Completes a node whose children are the next node and `second`, and whose subtree ends at the end of `tree`: sets
+  // its box and `after`.
   static void close(std::vector<Node>& tree, size_t node, size_t second) {
     for (const size_t child : {node + 1, second}) tree[node].box.take(tree[child].box);
     tree[node].after = tree.size();
   }
 };
 
-// Tells on which side of triangles points lie.
+// Orientation tests by signed volumes, with bounds on rounding.
 struct Sides {
-  double largest = 0;  // coordinate
+  double largest = 0;  // absolute coordinate of a vertex
 
+  // Returns the 1-norm, which is at least the length.
   static double length(const Vector& v) { return std::abs(v[0]) + std::abs(v[1]) + std::abs(v[2]); }
 
-  // Six times the volume of a tetrahedron; 0 where rounding may have made its sign: eight roundings in the sum, as in
-  // the error bound of Shewchuk 1997, and those of the coordinates themselves.
+  // Returns six times the signed volume of a tetrahedron, or 0 if rounding may have changed its sign. The bound covers
+  // eight roundings in the sum, as in the error bound of Shewchuk 1997, and those of the coordinates themselves.
   double volume(const Vector& a, const Vector& b, const Vector& c, const Vector& d) const {
     constexpr double kRounding = 8 * 0x1p-53;
     const Vector u = minus(b, a), v = minus(c, a), w = minus(d, a);
@@ -156,6 +163,7 @@ struct Sides {
     return std::abs(found) > kRounding * (x * y * z + largest * (x * y + y * z + z * x)) ? found : 0;
   }
 
+  // Returns whether the segment p q pierces the triangle a b c.
   bool goes_through(const Vector& p, const Vector& q, const Vector& a, const Vector& b, const Vector& c) const {
     if (!(volume(a, b, c, p) * volume(a, b, c, q) < 0)) return false;
     const double one = volume(p, q, a, b), two = volume(p, q, b, c), three = volume(p, q, c, a);
@@ -169,7 +177,7 @@ struct Triangles {
 
   Vector at(int64_t v) const { return {vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; }
 
-  // Around `count` vertices.
+  // Returns the bounding box of `count` vertices.
   Box around(const int64_t* v, int count) const {
     Box box;
     for (int k = 0; k < count; ++k) box.take(at(v[k]));
@@ -177,13 +185,14 @@ struct Triangles {
   }
 };
 
+// Returns the boxes of `count` elements with `corners` vertices each.
 std::vector<Box> boxes_around(const Triangles& mesh, int64_t count, const int64_t* corner, int corners) {
   std::vector<Box> boxes(count);
   for_rows(count, [&](int64_t i) { boxes[i] = mesh.around(corner + corners * i, corners); });
   return boxes;
 }
 
-// The faces whose boxes are near an edge's, and their boxes.
+// Returns the faces whose boxes touch the box of an edge, and reduces `boxes` to theirs.
 std::vector<int64_t> near_edges(std::vector<Box>& boxes, const std::vector<Box>& edges) {
   const BoxTree tree(edges);
   std::vector<uint8_t> near(boxes.size());
@@ -196,6 +205,7 @@ std::vector<int64_t> near_edges(std::vector<Box>& boxes, const std::vector<Box>&
   return kept;
 }
 
+// Appends the faces that an edge pierces to `found`, sorted.
 void find(const Triangles& mesh, const std::vector<int64_t>& faces, const BoxTree& tree, const Sides& sides,
           const int64_t* end, int64_t edge, Crossings& found) {
   const Vector p = mesh.at(end[0]), q = mesh.at(end[1]);

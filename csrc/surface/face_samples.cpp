@@ -5,7 +5,8 @@
 namespace linprim {
 namespace {
 
-// Whether a point lies in the image, and not behind the largest depth of the four pixels around it.
+// Returns whether a point lies in the image and is not farther away than (1 + behind) d + slack, with d the largest
+// depth of the four pixels around it.
 bool maybe_seen(const PhotoView& view, const double* point, double behind, double slack) {
   double at[3];
   to_camera(view, point, at);

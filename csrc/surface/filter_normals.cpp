@@ -15,13 +15,15 @@ void filter_normals(const NormalFilter& how, int64_t vertices, int64_t faces, co
   const std::vector<Vector> normal = average_normals(fans, start_normals, how.contrast, how.normal_rounds);
   const auto at = [&](int64_t v) { return Vector{vertex[3 * v], vertex[3 * v + 1], vertex[3 * v + 2]}; };
   const std::vector<double> start(vertex, vertex + 3 * vertices);
-  // The planes of faces go through their middles: how far these are ahead along the normals, and times the area.
+  // Offsets n . x of the faces' planes, which have the filtered normals and go through the centroids.
   std::vector<double> offset(faces);
   for (int round = 0; round < how.vertex_rounds; ++round) {
     for_rows(faces, [&](int64_t f) {
       const Vector a = at(corner[3 * f]), b = at(corner[3 * f + 1]), c = at(corner[3 * f + 2]);
       offset[f] = (dot(normal[f], a) + dot(normal[f], b) + dot(normal[f], c)) / 3;
     });
+    // Moves each vertex towards the planes of its faces, by the mean weighted by area, and back to within `bound` of
+    // its start.
     for_rows(vertices, [&](int64_t v) {
       const Vector here = at(v);
       Vector move{};

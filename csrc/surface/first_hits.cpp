@@ -12,19 +12,22 @@
 namespace linprim {
 namespace {
 
-// Pixels around what a face covers that are asked, too: more than float is off in images of 16,000 pixels.
+// Margin in pixels around the bounding box of a face: more than the rounding errors of float in images of 16,000
+// pixels.
 constexpr float kRoom = 1e-3f;
 
-// Where a vertex is in the image; NaN behind the camera.
+// Pixel coordinates of a vertex; NaN behind the camera.
 struct Place {
   float u = NAN, v = NAN;
 };
 
+// Columns or rows first .. end - 1.
 struct Range {
   int first, end;
 };
 
-// The numbers of the pixels whose centres are from `low` to `high`, without std::floor, which old processors lack.
+// Returns the columns or rows, of `size`, whose pixel centres lie between `low` and `high`. Does not use std::floor,
+// for which old processors have no instruction.
 Range centers(float low, float high, int size) {
   const float last = std::min(high - 0.5f + kRoom, float(size - 1)), first = std::max(low - 0.5f - kRoom, 0.0f);
   if (!(first <= last)) return {0, 0};
@@ -32,6 +35,7 @@ Range centers(float low, float high, int size) {
   return {number + (float(number) < first), int(last) + 1};
 }
 
+// Rasterizes faces into a depth buffer. Several threads may call draw() at the same time.
 class Drawing {
  public:
   Drawing(const PhotoView& view, int64_t vertices, const double* vertex, const int64_t* corner)
@@ -44,6 +48,7 @@ class Drawing {
     for (auto& pixel : nearest_) pixel.store(kNothing, std::memory_order_relaxed);
   }
 
+  // Draws a face: tests the pixel centres in its bounding box, or in the whole image if it reaches behind the camera.
   void draw(int64_t face) {
     const int64_t* corner = corner_ + 3 * face;
     const Place &p = place_[corner[0]], &q = place_[corner[1]], &r = place_[corner[2]];
@@ -56,7 +61,7 @@ class Drawing {
     }
     const Vector &a = at_[corner[0]], &b = at_[corner[1]], &c = at_[corner[2]];
     if (!before && beside(a, b, c)) return;
-    // A ray r goes through the face where the products of r with these have the sign of the volume.
+    // Edge functions: a ray hits the face if its products with all three have the sign of the volume.
     const Vector sides[3] = {cross(a, b), cross(b, c), cross(c, a)};
     const double volume = dot(sides[0], c), sign = volume < 0 ? -1 : 1;
     if (!(sign * volume > 0)) return;
@@ -69,6 +74,7 @@ class Drawing {
       }
   }
 
+  // Writes depth and face of every pixel.
   void write(float* depth, int32_t* face) const {
     for (size_t pixel = 0; pixel < nearest_.size(); ++pixel) {
       const uint64_t found = nearest_[pixel].load(std::memory_order_relaxed);
@@ -79,9 +85,10 @@ class Drawing {
   }
 
  private:
-  static constexpr uint64_t kNothing = UINT64_MAX;
+  static constexpr uint64_t kNothing = UINT64_MAX;  // no face yet
 
-  // Whether a face that is not wholly before the camera lies behind it or outside of one side of the image.
+  // Returns whether a face that is not entirely in front of the camera lies behind it or outside of one side of the
+  // view frustum.
   bool beside(const Vector& a, const Vector& b, const Vector& c) const {
     const auto all = [&](double x, double y, double z) {
       const Vector side{x, y, z};
@@ -91,7 +98,8 @@ class Drawing {
            all(-view_.fx, 0, view_.width - view_.cx) || all(0, -view_.fy, view_.height - view_.cy);
   }
 
-  // Depths that are not negative are in the order of their bits.
+  // Keeps the nearer face of a pixel, and of equally near ones the one with the lower number. Compares bits: those of
+  // depths that are not negative have the same order as the depths.
   void offer(int64_t pixel, float depth, int64_t face) {
     const uint64_t own = uint64_t(std::bit_cast<uint32_t>(depth)) << 32 | uint64_t(face);
     uint64_t least = nearest_[pixel].load(std::memory_order_relaxed);
@@ -102,7 +110,7 @@ class Drawing {
   const PhotoView& view_;
   const int64_t* corner_;
   std::vector<Place> place_;
-  std::vector<Vector> at_;                      // in the camera's space
+  std::vector<Vector> at_;                      // camera coordinates of the vertices
   std::vector<std::atomic<uint64_t>> nearest_;  // bits of the depth, then the face
 };
 

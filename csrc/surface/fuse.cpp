@@ -9,13 +9,16 @@ namespace {
 
 constexpr int64_t kBlocksPerTask = 16;
 
+// A vote for one voxel: signed distance in truncations, its weight, and the weight of free space.
 struct Vote {
   float value, weight, free;
 };
 
+// Computes the vote of a surfel for a voxel: `value` is the voxel's signed distance in truncations, `inverse_depth` its
+// 1/z.
 Vote vote(const Surfel& surfel, const VoteRules& rules, float value, float inverse_depth) {
   if (value > 1) return {1, 0, inverse_depth > surfel.nearest ? surfel.free : 0};
-  const float along = value / surfel.cosine;
+  const float along = value / surfel.cosine;  // distance along the ray
   const bool near_plane = value > -rules.grazed && along > -rules.grazed_reach;
   if (along < -1) {
     const float grazed = near_plane ? surfel.weight * rules.grazed_weight : 0, hidden = surfel.free * rules.occluded;
@@ -28,6 +31,7 @@ Vote vote(const Surfel& surfel, const VoteRules& rules, float value, float inver
   return {std::max(value, -1.0f), surfel.weight * share, 0};
 }
 
+// Adds the votes of a view to the block `row`.
 void add_block(const SurfelView& view, const VoteRules& rules, const VoxelSums& sums, int64_t row) {
   const double* corner = sums.corner + 3 * row;
   const float voxel = float(sums.voxel), origin[3] = {float(corner[0]), float(corner[1]), float(corner[2])};

@@ -12,22 +12,25 @@ namespace {
 
 using Index = std::array<int64_t, 3>;
 
-// Corners of a cube are numbered by their places along x, y and z as bits 0, 1 and 2.
+// Bits 0, 1 and 2 of a corner's number are its positions along x, y and z. An edge runs from corner `low` to corner
+// `high`.
 struct CubeEdge {
   int8_t low, high;
 };
-// Four along x, four along y, four along z.
+// Four edges along x, four along y, four along z.
 constexpr CubeEdge kEdges[12] = {{0, 1}, {2, 3}, {4, 5}, {6, 7}, {0, 2}, {1, 3},
                                  {4, 6}, {5, 7}, {0, 4}, {1, 5}, {2, 6}, {3, 7}};
-// Counter-clockwise seen from outside.
+// Corners of the faces of a cube, counter-clockwise seen from outside.
 constexpr int kFaces[6][4] = {{0, 4, 6, 2}, {1, 3, 7, 5}, {0, 1, 5, 4}, {2, 6, 7, 3}, {0, 2, 3, 1}, {4, 5, 7, 6}};
 
+// Returns the edge between two corners, or -1.
 int edge_between(int a, int b) {
   for (int e = 0; e < 12; ++e)
     if (kEdges[e].low == std::min(a, b) && kEdges[e].high == std::max(a, b)) return e;
   return -1;
 }
 
+// Returns whether two edges lie on the same face.
 bool share_face(int e, int f) {
   for (const auto& face : kFaces) {
     const auto on = [&](int edge) {
@@ -38,11 +41,13 @@ bool share_face(int e, int f) {
   return false;
 }
 
-// The closed lines in which a surface cuts the faces of a cube, as edges of the cube, by which of its corners are
-// inside (bit c for corner c). On a face of which two opposite corners are inside these are cut off one by one, on
-// both sides alike. Each line starts where a fan of triangles has no side across a face, which would be another's, too.
+// Closed polylines in which a surface cuts the faces of a cube, as sequences of the cube's edges, for one pattern of
+// inner corners (bit c for corner c). If two diagonally opposite corners of a face are inside, each is cut off
+// separately, which is the same for both cubes at the face. A loop starts where its triangle fan has no diagonal in a
+// face of the cube: the neighbouring cube might have the same one.
 using Loops = std::vector<std::vector<int8_t>>;
 
+// Computes the loops of one pattern of inner corners.
 Loops loops_of(int inside) {
   std::array<int8_t, 12> next;
   next.fill(-1);
@@ -75,6 +80,7 @@ Loops loops_of(int inside) {
   return loops;
 }
 
+// Returns the loops of all 256 patterns.
 const std::array<Loops, 256>& all_loops() {
   static const std::array<Loops, 256> table = [] {
     std::array<Loops, 256> made;
@@ -84,12 +90,13 @@ const std::array<Loops, 256>& all_loops() {
   return table;
 }
 
+// Packs a block index into a key of 63 bits.
 uint64_t packed(const Index& at) {
   constexpr int64_t kHalf = int64_t(1) << (kIndexBits - 1);
   return uint64_t(at[0] + kHalf) << (2 * kIndexBits) | uint64_t(at[1] + kHalf) << kIndexBits | uint64_t(at[2] + kHalf);
 }
 
-// Which block is where.
+// Finds blocks by their level and index.
 class BlockMap {
  public:
   explicit BlockMap(const VoxelBlocks& blocks) : blocks_(blocks) {
@@ -103,7 +110,8 @@ class BlockMap {
     return {at[0], at[1], at[2]};
   }
 
-  // The block of this level there, or the larger one that holds it; -1: none, or smaller ones.
+  // Returns the block of this level and index, or the larger block that contains it; -1 if there is none, or if only
+  // smaller blocks lie there.
   int64_t find(Index at, int level) const {
     for (; level < levels_; ++level) {
       const auto found = rows_[level].find(packed(at));
@@ -119,7 +127,8 @@ class BlockMap {
   std::vector<std::unordered_map<uint64_t, int64_t>> rows_;
 };
 
-// A vertex is named by the two voxels that it lies between, the first one in the upper half.
+// Marches cubes. The name of a vertex holds the two voxels that it lies between, the one with the lower number in the
+// upper 32 bits.
 struct Marcher {
   const VoxelBlocks& blocks;
   const BlockMap& map;
@@ -130,7 +139,7 @@ struct Marcher {
   explicit Marcher(const VoxelBlocks& blocks, const BlockMap& map)
       : blocks(blocks), map(map), loops(all_loops()), n(blocks.resolution), size(int64_t(n) * n * n) {}
 
-  // Voxel of a place, in finest voxels, in a block that holds it.
+  // Returns the voxel of a block that contains the position `place`, in finest voxels.
   uint32_t voxel(int64_t row, const Index& place) const {
     const Index at = map.index(row);
     const int level = int(blocks.level[row]);
@@ -139,6 +148,8 @@ struct Marcher {
     return uint32_t(row * size + (z * n + y) * n + x);
   }
 
+  // Appends the triangles of one cube as names of vertices. `corner` holds its voxels; where some coincide, vertices
+  // and triangles that collapse are left out.
   void march(const std::array<uint32_t, 8>& corner, std::vector<uint64_t>& out) const {
     int inside = 0;
     for (int c = 0; c < 8; ++c) {
@@ -160,7 +171,7 @@ struct Marcher {
     }
   }
 
-  // The cubes of which block `row` is the first of the smallest.
+  // Marches the cubes for which block `row` is the first of the smallest blocks of their corners.
   void march_block(int64_t row, std::vector<uint64_t>& out) const {
     const int level = int(blocks.level[row]);
     const Index at = map.index(row);
@@ -182,7 +193,8 @@ struct Marcher {
             }
             mine = found >= 0 && (blocks.level[found] > level || found > row);
             if (!mine) continue;
-            // The voxel there that touches the cube's middle, by its finest part that does.
+            // Takes the voxel of that block that touches the cube's middle: it contains the finest voxel at this corner
+            // of the middle.
             Index place = {at[0] * n + i, at[1] * n + j, at[2] * n + k};
             for (int a = 0; a < 3; ++a) place[a] = (place[a] << level) - 1 + (c >> a & 1);
             corner[c] = voxel(found, place);
@@ -191,6 +203,7 @@ struct Marcher {
         }
   }
 
+  // Returns twice the centre of a voxel, in finest voxels, which is an integer.
   Index twice_center(uint32_t voxel) const {
     const int64_t row = voxel / size, cell = voxel % size;
     const Index at = map.index(row), in = {cell % n, cell / n % n, cell / n / n};
@@ -200,6 +213,7 @@ struct Marcher {
     return center;
   }
 
+  // Writes the position of a vertex: the zero of the distance, linear between the centres of its two voxels.
   void place(uint64_t name, double* out) const {
     const uint32_t a = uint32_t(name >> 32), b = uint32_t(name);
     const Index from = twice_center(a), to = twice_center(b);

@@ -5,8 +5,9 @@
 namespace linprim {
 namespace {
 
-constexpr double kLeastFacing = 0.1;
+constexpr double kLeastFacing = 0.1;  // lower limit of the cosine of the viewing angle in slopes
 
+// Adds the samples of one point, if the photograph sees it well.
 void add_point(const PhotoView& view, const float* jump, const PhotoRules& rules, const double* offset, int offsets,
                const PhotoSums& sums, int64_t p) {
   SeenPoint seen;

@@ -5,9 +5,11 @@
 namespace linprim {
 namespace {
 
-// Slopes that the depth on an outline jumps by, and that a point on it lies behind what is nearest.
+// A sample is on an outline if the depth around its pixel jumps by more than kOutlineSlopes slopes, or if the point
+// lies more than kBehindSlopes slopes behind the nearest depth around it.
 constexpr double kOutlineSlopes = 4, kBehindSlopes = 2;
 
+// Adds the sample of one point to its kKeptSamples best ones, if the photograph sees the point.
 void add_color(const PhotoView& view, const float* near, const float* far, const ColorRules& rules,
                const ColorSamples& samples, int64_t p) {
   SeenPoint seen;

@@ -1,4 +1,5 @@
-// Boxes around the points, halved along their longest side; a body goes down those that no face of it has outside.
+// Bounding box hierarchy of the points, split at the median along the longest side. A body descends into the boxes that
+// are not entirely outside of one of its faces.
 #include "surface/points_within.h"
 
 #include <algorithm>
@@ -12,8 +13,9 @@ namespace {
 constexpr int64_t kLeaf = 16;  // points in a leaf at most
 constexpr int64_t kBodiesPerTask = 64;
 
-// Points begin .. end - 1 of the order. Its first child is the next node, unless that is `after`, the next one that is
-// not below it: a leaf.
+// A node with the points begin .. end - 1 of `PointTree::order`. Nodes are in depth-first order: the first child of a
+// node is the next node, and `after` is the next node that is not below it. A leaf has no node between itself and
+// `after`.
 struct PointNode {
   double low[3], high[3];
   int64_t begin, end;
@@ -25,6 +27,7 @@ struct PointTree {
   std::vector<int64_t> order;
   std::vector<PointNode> nodes;
 
+  // Builds the subtree of a range of the order.
   void build(int64_t begin, int64_t end) {
     const size_t at = nodes.size();
     nodes.emplace_back();
@@ -50,12 +53,14 @@ struct PointTree {
   }
 };
 
-// How far ahead of the centre, along the normal of a face, x lies. Monotonic in every coordinate, rounding included.
+// Returns the signed distance of x from the centre along the normal of a face. Monotonic in every coordinate, rounding
+// included.
 double ahead(const double* normal, const double* center, const double* x) {
   return normal[0] * (x[0] - center[0]) + normal[1] * (x[1] - center[1]) + normal[2] * (x[2] - center[2]);
 }
 
-// The points within a body, in order; none if fewer than `least` are within it before it is enlarged.
+// Returns the points within an enlarged body, sorted; none if fewer than `least` lie within the body before it is
+// enlarged.
 std::vector<int64_t> find(const PointTree& tree, const ConvexBodies& bodies, int64_t body, double enlarged,
                           int64_t least) {
   const double* center = bodies.center + 3 * body;

@@ -1,5 +1,5 @@
-// The hierarchy of boxes behind segment optical depths: built by halves, walked by the kernels of the instruction set
-// in use.
+// Builds the bounding box hierarchy for optical depths of segments by median splits, and runs the traversal kernel of
+// the instruction set in use.
 #include "surface/segment_depth.h"
 
 #include <algorithm>
@@ -17,14 +17,16 @@ namespace {
 
 constexpr int64_t kLeaf = 4;  // solids in a leaf at most
 constexpr int64_t kSegmentsPerTask = 512;
-// As in primitive_pose.h.
+// Limits of density and extent, as in primitive_pose.h.
 constexpr double kLargestDensity = 1e20, kSmallestExtent = 1e-15, kLargestExtent = 1e12;
 
+// Axis-aligned bounding box.
 struct Box {
   std::array<double, 3> low, high;
 };
 
-// Columns are the local axes in the world.
+// Computes the rotation matrix of a quaternion of any length; (0, 0, 0, 0) is no rotation. Columns are the local axes
+// in the world.
 void rotation_matrix(const double q_raw[4], double r[3][3]) {
   double scale = 0, q[4];
   for (int k = 0; k < 4; ++k) scale = std::max(scale, std::abs(q_raw[k]));
@@ -41,6 +43,7 @@ void rotation_matrix(const double q_raw[4], double r[3][3]) {
   std::memcpy(r, m, sizeof m);
 }
 
+// Appends nodes in depth-first order, and solids in the order of the leaves.
 struct Builder {
   const std::vector<Box>& boxes;
   const std::vector<SlabSolid>& from;
@@ -48,6 +51,8 @@ struct Builder {
   std::vector<SlabSolid>& solids;
   std::vector<SolidNode>& nodes;
 
+  // Builds the subtree of the solids begin .. end - 1 of `order`, split at the median of their centres along the axis
+  // in which these extend farthest.
   void build(int64_t begin, int64_t end) {
     const size_t at = nodes.size();
     nodes.emplace_back();
@@ -129,6 +134,7 @@ void SolidTree::optical_depth(const double* origin, const double* ends, const do
     std::fill(depth, depth + count, 0.0);
     return;
   }
+  // The solids relative to the origin of all segments.
   std::vector<SeenSolid> seen(solids_.size());
   for (size_t i = 0; i < seen.size(); ++i) {
     const SlabSolid& from = solids_[i];

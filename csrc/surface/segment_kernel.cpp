@@ -1,4 +1,4 @@
-// Optical depth along segments in packets of neighbours, compiled once per instruction set like kernels.cpp.
+// Optical depth along segments, in packets of neighbours; compiled once per instruction set like kernels.cpp.
 #ifndef LINPRIM_ISA
 #error "compile this file with -DLINPRIM_ISA=<name> -DLINPRIM_ISA_<NAME>=1"
 #endif
@@ -9,19 +9,21 @@
 namespace linprim {
 namespace LINPRIM_ISA {
 
-// Boxes on the way to a leaf: each halves the number of solids, of which there are less than 2^31.
+// Size of the traversal stack. Each level of the hierarchy halves the number of solids, which is less than 2^31.
 constexpr int kMostLevels = 64;
-// A rate smaller than this is taken as this, so that its inverse is finite: such a segment stays on its side of the
-// plane.
+// Smallest rate of change of a coordinate along a segment. A smaller one is replaced by it, so that its inverse is
+// finite: such a segment stays on its side of the plane.
 constexpr double kSmallestRate = 1e-280;
 
 inline D inverse_of(D rate) { return 1.0 / (vabs(rate) < kSmallestRate ? splat(kSmallestRate) : rate); }
 
-// Segments that go through the hierarchy together.
+// Segments that traverse the hierarchy together, one per lane: vector from origin to end and its inverses, fraction at
+// which the segment begins, length of the vector, sum so far.
 struct Packet {
   D direction[3], inverse[3], begin, length, sum;
 };
 
+// Returns which segments meet the box of a node (slab test).
 inline B meets_box(const Packet& p, const SolidNode& node, const double* origin) {
   D in = p.begin, out = splat(1.0);
   for (int k = 0; k < 3; ++k) {
@@ -31,6 +33,7 @@ inline B meets_box(const Packet& p, const SolidNode& node, const double* origin)
   return (B)(in <= out);
 }
 
+// Adds the density of a solid times the lengths of the segments inside its four slabs.
 inline void add_solid(Packet& p, const SeenSolid& solid) {
   D in = p.begin, out = splat(1.0);
   for (int j = 0; j < 4; ++j) {
@@ -42,8 +45,8 @@ inline void add_solid(Packet& p, const SeenSolid& solid) {
   p.sum += solid.density * p.length * vmax(out - in, D{});
 }
 
-// Near child first, as seen from the origin: the order of the sum is the same for every segment, and opaque ones end
-// early.
+// Computes the depths of segments [begin, end). The near child, as seen from the origin, is visited first: the order of
+// the sum is the same for every segment, and opaque segments end early.
 inline void segment_depths(const SegmentParams& P, int64_t begin, int64_t end) {
   for (int64_t first = begin; first < end; first += kLanes) {
     const int lanes = int(end - first < kLanes ? end - first : kLanes);

@@ -14,13 +14,15 @@ namespace {
 
 using Row = int32_t;
 
-constexpr double kMostTurn = 0.5;             // cosine: a face that one collapse turns by more has folded over
-constexpr double kSliver = 0.17364817766693;  // sine of 10 degrees
-// What a squared distance from where corners of faces were counts beside one from their planes: it spaces vertices out
-// where all places are as good. Each of the rounds leaves that share of how far this pulls a vertex off the planes.
+constexpr double kMostTurn = 0.5;  // least cosine of a face's turn in one collapse: beyond, it has folded over
+constexpr double kSliver = 0.17364817766693;  // sine of 10 degrees: smaller angles may not become smaller still
+// Weight of squared distances from the corners of the given faces, relative to squared distances from their planes: it
+// spaces vertices out where all positions are equally good. This term pulls a vertex off the planes; each of the rounds
+// reduces that to this share.
 constexpr double kSpacing = 1e-3;
 constexpr int kRounds = 3;
-// Whether a collapse is refused changes with what is around: the queue is made anew while this share of faces goes.
+// A refused collapse may be allowed after changes around it: passes with a new queue are repeated as long as one
+// removes more than this share of the faces.
 constexpr double kWorthwhile = 0.01;
 
 Vector plus(Vector a, double factor, const Vector& b) {
@@ -30,12 +32,14 @@ Vector plus(Vector a, double factor, const Vector& b) {
 
 double squared(const Vector& a) { return dot(a, a); }
 
-// Squared distances from planes, x A x - 2 b x + c with the upper triangle of A row by row, and from points.
+// Quadric error: weighted squared distances from planes, x A x - 2 b x + c with the upper triangle of A row by row, and
+// from points.
 struct Quadric {
   std::array<double, 6> a{};
-  Vector b{}, points{};  // points: their sum
+  Vector b{}, points{};  // points: their weighted sum
   double c = 0, weight = 0, points_squared = 0;
 
+  // Adds a point and the plane through it, with the weight `by`.
   void add_corner(double by, const Vector& normal, const Vector& point) {
     int k = 0;
     for (int i = 0; i < 3; ++i)
@@ -53,6 +57,7 @@ struct Quadric {
     weight += other.weight;
   }
 
+  // Returns the error at x: from the planes, and kSpacing times that from the points.
   double at(const Vector& x) const {
     const Vector ax{a[0] * x[0] + a[1] * x[1] + a[2] * x[2], a[1] * x[0] + a[3] * x[1] + a[4] * x[2],
                     a[2] * x[0] + a[4] * x[1] + a[5] * x[2]};
@@ -60,7 +65,7 @@ struct Quadric {
     return planes + kSpacing * (weight * squared(x) - 2 * dot(points, x) + points_squared);
   }
 
-  // The place that is nearest to the planes and, of those as near, to the middle of the points.
+  // Returns the position that is nearest to the planes and, of equally near ones, to the mean of the points.
   Vector nearest() const {
     Vector x{};
     add(x, 1 / weight, points);
@@ -69,7 +74,7 @@ struct Quadric {
   }
 
  private:
-  // Where the distance from the planes and that from x, which counts kSpacing, are least together.
+  // Minimises the squared distance from the planes plus that from x, which has the weight kSpacing.
   Vector nearer(const Vector& x) const {
     const double s = kSpacing * weight;
     const double a0 = a[0] + s, a3 = a[3] + s, a5 = a[5] + s;
@@ -103,7 +108,7 @@ double squared_distance_to_triangle(const Vector& p, const std::array<Vector, 3>
   return least;
 }
 
-// Sine of the least angle of a triangle, which is that between its two longest edges.
+// Returns the sine of the smallest angle of a triangle, which is that between its two longest edges.
 double least_sine(const std::array<Vector, 3>& t) {
   double length[3];
   for (int k = 0; k < 3; ++k) length[k] = std::sqrt(squared(minus(t[(k + 1) % 3], t[k])));
@@ -112,6 +117,7 @@ double least_sine(const std::array<Vector, 3>& t) {
   return length[2] > 0 ? area / (length[1] * length[2]) : 0.0;
 }
 
+// A possible collapse. It is outdated when the stamp of a vertex has changed.
 struct Candidate {
   double cost;
   Row from, to;
@@ -124,11 +130,13 @@ struct Candidate {
   }
 };
 
+// A collapse of `from` into `to`, which moves to `place`.
 struct Move {
   Row from, to;
   Vector place;
 };
 
+// Collapses edges of a mesh, as described at `simplify`.
 class Simplifier {
  public:
   Simplifier(int64_t vertices, int64_t faces, const double* vertex, const int64_t* corner, const double* tolerance)
@@ -176,7 +184,7 @@ class Simplifier {
     return {place_[corner_[face][0]], place_[corner_[face][1]], place_[corner_[face][2]]};
   }
 
-  // The corners of a face with the vertices `from` and `to` at a place.
+  // Returns the corners of a face with the vertices `from` and `to` moved to `place`.
   std::array<Vector, 3> corners(Row face, Row from, Row to, const Vector& place) const {
     std::array<Vector, 3> t;
     for (int k = 0; k < 3; ++k) {
@@ -190,8 +198,8 @@ class Simplifier {
     return corner_[face][0] == vertex || corner_[face][1] == vertex || corner_[face][2] == vertex;
   }
 
-  // Calls body(other) for the two vertices of the faces around v that are not v: one inside twice, one on a border
-  // once.
+  // Calls body(other) for the other two vertices of each face around v: twice for a neighbour along an inner edge, once
+  // along a boundary edge.
   template <class Body>
   void neighbours(Row v, const Body& body) const {
     for (Row f : around_[v])
@@ -199,11 +207,13 @@ class Simplifier {
         if (other != v) body(other);
   }
 
+  // Returns the number of faces at the edge u v.
   int faces_at(Row u, Row v) const {
     return int(std::count_if(around_[u].begin(), around_[u].end(), [&](Row f) { return has(f, v); }));
   }
 
-  // Whether a vertex is on a border, and whether it stays: unless its faces make one fan.
+  // Determines whether a vertex is on a boundary, and whether it is locked: it is unless the faces around it form one
+  // fan.
   void look_around(Row v) {
     int open = 0;
     bool manifold = true;
@@ -216,7 +226,7 @@ class Simplifier {
     locked_[v] = !manifold || (open != 0 && open != 2) || !is_one_fan(v);
   }
 
-  // Whether all faces around a vertex are reached from the first through edges at the vertex.
+  // Returns whether all faces around a vertex are reached from the first one through edges at the vertex.
   bool is_one_fan(Row v) const {
     std::vector<Row> reached(around_[v].begin(), around_[v].begin() + std::min<size_t>(1, around_[v].size()));
     for (size_t i = 0; i < reached.size(); ++i)
@@ -227,6 +237,7 @@ class Simplifier {
     return reached.size() == around_[v].size();
   }
 
+  // Adds the plane of a face to the quadrics of its corners, weighted by area / 3 over the squared tolerance.
   void add_face(Row face) {
     const auto t = corners(face);
     Vector normal = cross(minus(t[1], t[0]), minus(t[2], t[0]));
@@ -238,6 +249,7 @@ class Simplifier {
     }
   }
 
+  // Fills the queue with all edges and collapses the cheapest until it is empty.
   void pass() {
     std::vector<Candidate> first;
     for (Row v = 0; v < Row(place_.size()); ++v)
@@ -262,6 +274,7 @@ class Simplifier {
     }
   }
 
+  // Adds the possible collapses of the edge u v.
   void add_candidate(std::vector<Candidate>& candidates, Row u, Row v) const {
     if (locked_[u] || locked_[v]) return;
     const Quadric sum = quadric_of(u, v);
@@ -270,7 +283,7 @@ class Simplifier {
       candidates.push_back({sum.at(sum.nearest()), u, v, stamp_[u], stamp_[v]});
       return;
     }
-    // One of the border's vertices stays where it is: then the border keeps to its line.
+    // At a boundary, the remaining vertex is a boundary vertex and stays in place, so that the boundary keeps its line.
     if (border_[u] && border_[v] && faces_at(u, v) != 1) return;
     for (const auto& [from, to] : {std::pair(u, v), std::pair(v, u)})
       if (border_[to]) candidates.push_back({sum.at(place_[to]), from, to, stamp_[from], stamp_[to]});
@@ -282,7 +295,8 @@ class Simplifier {
     return sum;
   }
 
-  // False where it would break a rule; else `from` is gone and `to` is at its new place.
+  // Collapses `from` into `to` unless that breaks a rule; returns whether it did. Then `from` is removed and `to` has
+  // its new position.
   bool collapse(Row from, Row to) {
     rest_.clear(), both_.clear();
     for (Row f : around_[from]) (has(f, to) ? both_ : rest_).push_back(f);
@@ -313,7 +327,7 @@ class Simplifier {
     return true;
   }
 
-  // Whether the two vertices have no neighbours in common but those of the faces that go.
+  // Link condition: returns whether the two vertices have no common neighbours but those in the faces to be removed.
   bool keeps_topology(Row from, Row to) {
     ++now_;
     neighbours(from, [&](Row other) { mark_[other] = now_; });
@@ -326,7 +340,8 @@ class Simplifier {
     return common == int(both_.size());
   }
 
-  // Whether no face folds over, becomes a sliver or loses its area.
+  // Returns whether no face folds over, loses its area, or gets an angle below 10 degrees that is smaller than all
+  // before.
   bool keeps_shape(const Move& how) const {
     double before = kSliver;
     for (const auto* faces : {&both_, &rest_})
@@ -341,7 +356,9 @@ class Simplifier {
     return true;
   }
 
-  // Whether all vertices that are gone stay within their tolerance; `nearest_` then has the face nearest to each.
+  // Returns whether the given positions of all removed and moved vertices stay within their tolerance of the faces,
+  // and, in a collapse along a boundary, those of boundary vertices within it of the boundary. Then `nearest_` holds
+  // the nearest face of each.
   bool keeps_distance(const Move& how, bool along_border) {
     nearest_.clear();
     ring_.clear();
@@ -367,7 +384,7 @@ class Simplifier {
     return true;
   }
 
-  // The edges of the border among the faces around, as they will be.
+  // Collects the boundary edges of the faces around, at their positions after the collapse.
   void find_border(const Move& how) {
     open_.clear();
     for (Row f : rest_)
@@ -379,12 +396,14 @@ class Simplifier {
       }
   }
 
+  // Returns the squared distance from these edges.
   double distance_to_border(const Vector& point) const {
     double least = std::numeric_limits<double>::infinity();
     for (const auto& [a, b] : open_) least = std::min(least, squared_distance_to_segment(point, a, b));
     return least;
   }
 
+  // Returns the remaining vertices and faces, in the order of the given ones.
   Triangles result() const {
     std::vector<int64_t> row(place_.size(), -1);
     Triangles made;
@@ -406,17 +425,18 @@ class Simplifier {
 
   std::vector<Vector> place_, given_;
   const double* tolerance_;
-  std::vector<uint8_t> moved_;  // whether a vertex is gone from where it was, and kept with a face
+  std::vector<uint8_t> moved_;  // whether a vertex was removed or moved, and so is kept with a face in `gone_`
   std::vector<uint8_t> border_, locked_;
-  std::vector<uint32_t> stamp_, mark_;
+  std::vector<uint32_t> stamp_, mark_;  // collapses of a vertex; last visit, in terms of `now_`
   uint32_t now_ = 0;
   std::vector<Quadric> quadric_;
   std::vector<std::vector<Row>> around_;
   std::vector<std::array<Row, 3>> corner_;
   std::vector<uint8_t> alive_;
-  std::vector<std::vector<Row>> gone_;  // by face: the vertices to which it is nearest
+  std::vector<std::vector<Row>> gone_;  // per face: the removed and moved vertices to which it is nearest
   std::priority_queue<Candidate> queue_;
-  // Of the collapse that is looked at: the faces that go and that stay, and these as they will be.
+  // Of the collapse under test: faces to be removed, faces that stay, and the corners of the latter, the boundary edges
+  // and the nearest faces of removed vertices after the collapse.
   std::vector<Row> both_, rest_;
   std::vector<std::array<Vector, 3>> ring_;
   std::vector<std::array<Vector, 2>> open_;

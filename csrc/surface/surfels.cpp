@@ -10,10 +10,11 @@
 namespace linprim {
 namespace {
 
-constexpr float kFarInFront = 1e9f;  // truncations: before any surface
-constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
+constexpr float kFarInFront = 1e9f;  // signed distance in truncations, in front of any surface
+constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();  // inverse depth without a surface
 
-// The slope of the inverse depth between neighbours on the side that belongs to the same surface; NaN is no neighbour.
+// Returns the slope of the inverse depth from the neighbours that belong to the same surface: the mean of both slopes
+// if these are similar, else the flatter one. A neighbour that is NaN is missing; without neighbours the slope is 0.
 double slope_of(double before, double here, double after, double tolerance, double ratio) {
   const double ahead = after - here, back = here - before;
   if (std::isnan(ahead) && std::isnan(back)) return 0;
@@ -24,6 +25,7 @@ double slope_of(double before, double here, double after, double tolerance, doub
   return std::abs(ahead) <= std::abs(back) ? ahead : back;
 }
 
+// Computes the surfel of a pixel from the inverse depths of it and its neighbours.
 Surfel surfel_at(const DepthMap& map, const SurfelRules& rules, const std::vector<double>& inverse, int x, int y) {
   const auto at = [&](int column, int row) {
     const bool inside = column >= 0 && row >= 0 && column < map.width && row < map.height;
@@ -32,8 +34,8 @@ Surfel surfel_at(const DepthMap& map, const SurfelRules& rules, const std::vecto
   const int64_t pixel = int64_t(y) * map.width + x;
   const double here = inverse[pixel], confidence = map.confidence[pixel];
   Surfel surfel{};
-  // A pixel beside the outline of something nearer says nothing about what is level with that: its free votes hold only
-  // in front of all its neighbours.
+  // Beside the outline of something nearer, a pixel does not tell whether space at that depth is free: its votes for
+  // free space count only in front of all its neighbours.
   for (int row = y - 1; row <= y + 1; ++row)
     for (int column = x - 1; column <= x + 1; ++column)
       if (at(column, row) > surfel.nearest) surfel.nearest = float(at(column, row));
@@ -42,7 +44,7 @@ Surfel surfel_at(const DepthMap& map, const SurfelRules& rules, const std::vecto
     return surfel;
   }
   const double rx = (x + 0.5 - map.cx) / map.fx, ry = (y + 0.5 - map.cy) / map.fy, square = rx * rx + ry * ry + 1;
-  // Half a voxel of depth between neighbours is no sign of an edge.
+  // A difference of half a voxel of depth between neighbours is no sign of an edge.
   const double tolerance = 0.5 * rules.voxel * here * here;
   double a = map.fx * slope_of(at(x - 1, y), here, at(x + 1, y), tolerance, rules.slope_ratio);
   double b = map.fy * slope_of(at(x, y - 1), here, at(x, y + 1), tolerance, rules.slope_ratio);

@@ -13,7 +13,7 @@ constexpr int64_t kPointsPerItem = 4096;
 
 VisiblePoints visible_points(const PhotoView& view, const double* point, int64_t count, uint8_t* inside) {
   const int64_t items = (count + kPointsPerItem - 1) / kPointsPerItem;
-  std::vector<ImagePlace> found(count);  // of each item from its first point on
+  std::vector<ImagePlace> found(count);  // those of an item are stored from its first point on
   std::vector<int64_t> first(items + 1, 0);
   parallel_for(items, [&](int64_t item, int) {
     const int64_t begin = item * kPointsPerItem, end = std::min(begin + kPointsPerItem, count);
