@@ -1,5 +1,5 @@
-"""What several test files share: a cache of their own, a tiny capture, one run trained on it, one in blocks, and a
-run whose surface is known exactly."""
+"""Fixtures that several test files share: a cache folder for tests only, a tiny capture, a run trained on it, a run in
+blocks, and a run with an exactly known surface."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import shutil
 import sys
 from pathlib import Path
 
-# The matrices here are small, and OpenBLAS's threads wait for each other in a loop: on a busy machine a hundredfold of
-# the work.
+# Matrices in the tests are small, and the threads of OpenBLAS wait for each other in a busy loop: on a loaded machine
+# this takes a hundred times as long as the work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Tests start a hundred processes, each of which would compile the package again; so would this one the tests.
+# Keeps bytecode caches: tests start a hundred processes, each of which would compile the package again, and this
+# process would compile the tests again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
@@ -24,17 +25,17 @@ from linprim_geo.base.files import locked
 
 sys.dont_write_bytecode = False
 
-# Half-axes and rotation (w, x, y, z) of the one octahedron of `solid`, whose middle is at CENTER.
+# Half-axes, rotation (w, x, y, z) and centre of the only octahedron of `solid`.
 EXTENT, ROTATION, CENTER = (0.9, 0.6, 0.7), (0.8, 0.2, -0.4, 0.4), (3.0, -2.0, 1.0)
-# So dense that half of the light is gone 1e-5 behind the surface.
+# So dense that half of the light is absorbed within 1e-5 behind the surface.
 DENSITY = 7e4
-# What other tests may have extracted into `tiny_run`, left out of copies.
+# Leaves the meshes that other tests may have extracted into `tiny_run` out of copies.
 MESHES = shutil.ignore_patterns("mesh")
 
 
 def with_budget(call, seconds: float):
-    """(what `call(seconds)` returns, the seconds). A loaded machine that needs more gets twice as much, up to three
-    times."""
+    """Calls call(seconds) and returns its result and the seconds. If it refuses because the machine needs more time, it
+    is called again with twice the time that it names, up to three times."""
     for _ in range(3):
         try:
             return call(seconds), seconds
@@ -48,7 +49,7 @@ def with_budget(call, seconds: float):
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_folder(tmp_path_factory):
-    """Tests neither read nor fill the user's cache."""
+    """Sets a temporary cache folder, so that tests neither read nor fill the user's cache."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LINPRIM_GEO_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
@@ -56,7 +57,7 @@ def cache_folder(tmp_path_factory):
 
 @pytest.fixture
 def one_thread():
-    """torch with one thread."""
+    """Limits torch to one thread."""
     import torch
 
     before = torch.get_num_threads()
@@ -67,7 +68,7 @@ def one_thread():
 
 @pytest.fixture
 def few_threads(one_thread):
-    """The core with one thread as well; what a test does to its threads and instruction set is undone."""
+    """Limits the core to one thread as well; restores its threads and instruction set after the test."""
     from linprim_geo.kernels import ops
 
     before = ops.threads(), ops.instruction_set()
@@ -78,7 +79,7 @@ def few_threads(one_thread):
 
 
 def made_once(tmp_path_factory, name: str, make) -> Path:
-    """The folder `name` that `make(folder)` makes, once for all processes of the tests."""
+    """Returns the folder `name`, which `make(folder)` makes once for all test processes."""
     base = tmp_path_factory.getbasetemp()
     base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     with locked(base, "made", name, wait=lambda: None):
@@ -91,8 +92,8 @@ def made_once(tmp_path_factory, name: str, make) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory) -> Path:
-    """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply. For all
-    processes of the tests: not to be changed."""
+    """The built-in part with transparent background: 12 + 3 views of 48x48, 400 points, depth, reference.ply. Shared by
+    all test processes: must not be changed."""
     from linprim_geo.synthetic.synth import synthesize
 
     def make(out):
@@ -103,7 +104,7 @@ def tiny_scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_options():
-    """Options of `tiny_run`: it grows from 200 to 300 primitives and has two checkpoints."""
+    """Options of `tiny_run`, which grows from 200 to 300 primitives and has two checkpoints."""
     from linprim_geo.base.options import TrainOptions
 
     return TrainOptions(
@@ -119,7 +120,7 @@ def tiny_options():
 
 @pytest.fixture(scope="session")
 def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
-    """A run trained on `tiny_scene`, for the tests of this process. Tests that change it copy it."""
+    """A run trained on `tiny_scene`, shared by the tests of one process. Tests that change it copy it."""
     from linprim_geo.training.train import train
 
     trained = made_once(
@@ -130,8 +131,8 @@ def tiny_run(tiny_scene, tiny_options, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def blocks_run(tiny_scene, tmp_path_factory) -> tuple[Path, dict]:
-    """An undisturbed run in two blocks, all by this process, and what training said. For all processes of the tests, as
-    it cannot be moved: not to be changed."""
+    """A run in two blocks, trained without interruption in one process, and the result of the training. Shared by all
+    test processes, as it cannot be moved: must not be changed."""
     from helpers.block_runs import COUNT, OPTIONS
     from helpers.here import Here
 
@@ -154,7 +155,7 @@ def run_copy(tiny_run, tmp_path) -> Path:
 
 
 def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size: int = 64) -> Path:
-    """A run that holds the one octahedron of this module, photographed from all around, without training."""
+    """Makes a run, without training, of the octahedron of this module, photographed from all around."""
     from linprim_geo.geometry.primitives import Primitives
 
     one = Primitives(
@@ -168,7 +169,7 @@ def octahedron_run(folder: Path, density: float = DENSITY, views: int = 24, size
 
 
 def exact_run(folder: Path, primitives, views: int = 24, size: int = 64) -> Path:
-    """A run that holds the given primitives of one colour, photographed from all around, without training."""
+    """Makes a run, without training, of the given primitives of one colour, photographed from all around."""
     from linprim_geo.base.options import SceneOptions, TrainOptions
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.primitives import Primitives
@@ -203,5 +204,5 @@ def exact_run(folder: Path, primitives, views: int = 24, size: int = 64) -> Path
 
 @pytest.fixture(scope="session")
 def solid(tmp_path_factory) -> Path:
-    """A run of one opaque octahedron; its scene's reference.ply is the same surface."""
+    """A run of one opaque octahedron; reference.ply of its scene is the same surface."""
     return octahedron_run(tmp_path_factory.mktemp("solid"))

@@ -1,4 +1,4 @@
-"""The training in blocks that several files test, and what two runs in blocks have in common."""
+"""Options of the training in blocks that several files test, and a comparison of two runs in blocks."""
 
 from __future__ import annotations
 
@@ -17,5 +17,6 @@ COUNT = 2
 
 
 def assert_same(run: Path, reference: Path) -> None:
+    """Checks that the saved files of two runs have the same bytes."""
     for name in SAVED:
         assert (run / name).read_bytes() == (reference / name).read_bytes(), name

@@ -15,7 +15,7 @@ OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def look_at(center, target=(0.0, 0.0, 0.0), size=(32, 24), focal=30.0, up=(0.0, 0.0, 1.0), shift=(0.0, 0.0)) -> Camera:
-    """A camera at `center` that looks at `target`; `shift` moves the principal point off the middle."""
+    """Returns a camera at `center` that looks at `target`; `shift` moves the principal point off the middle."""
     center = np.asarray(center, dtype=np.float64)
     z = np.asarray(target) - center
     z /= np.linalg.norm(z)
@@ -29,13 +29,13 @@ def look_at(center, target=(0.0, 0.0, 0.0), size=(32, 24), focal=30.0, up=(0.0, 
 
 
 def ring(count=10, radius=4.0, **options) -> list[Camera]:
-    """Cameras round the z axis at changing heights, looking at the origin."""
+    """Returns cameras around the z axis at changing heights, looking at the origin."""
     angles = 2 * np.pi * np.arange(count) / count
     return [look_at((radius * np.cos(a), radius * np.sin(a), 1.0 + 0.5 * np.sin(3 * a)), **options) for a in angles]
 
 
 def picture(index: int, size=(32, 24), alpha=None) -> Image.Image:
-    """A picture that differs from index to index; `alpha` is an (H, W) array or None."""
+    """Returns an image of random pixels, seeded by `index`; `alpha` is an (H, W) array or None."""
     rng = np.random.default_rng(index)
     rgb = rng.integers(0, 256, (size[1], size[0], 3), dtype=np.uint8)
     if alpha is None:
@@ -44,7 +44,7 @@ def picture(index: int, size=(32, 24), alpha=None) -> Image.Image:
 
 
 def transforms(cameras, paths, **extra) -> dict:
-    """The contents of a transforms.json with one set of intrinsics, that of the first camera."""
+    """Returns the contents of a transforms.json with one set of intrinsics, that of the first camera."""
     c = cameras[0]
     header = {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy, **extra}
     header["frames"] = [
@@ -55,7 +55,7 @@ def transforms(cameras, paths, **extra) -> dict:
 
 
 def write_transforms(root: Path, count=10, name="transforms.json", alpha=None, **extra) -> list[Camera]:
-    """A folder with `images/00.png` ... and a transforms file; returns the cameras."""
+    """Writes a folder with `images/00.png` ... and a transforms file; returns the cameras."""
     cameras = ring(count)
     (root / "images").mkdir(parents=True, exist_ok=True)
     paths = [f"images/{i:02d}.png" for i in range(count)]
@@ -73,7 +73,7 @@ def edit(path: Path, change) -> None:
 
 
 def reconstruction(cameras, names, xyz, model="PINHOLE", params=None):
-    """A pycolmap reconstruction of these cameras; every point is seen by the first two images."""
+    """Returns a pycolmap reconstruction of these cameras; every point is seen by the first two images."""
     import pycolmap
 
     out = pycolmap.Reconstruction()
@@ -96,7 +96,7 @@ def reconstruction(cameras, names, xyz, model="PINHOLE", params=None):
 
 
 def write_colmap(root: Path, count=10, points=20, folder="sparse/0", text=False, model="PINHOLE", params=None):
-    """A folder with `images/00.png` ... and a COLMAP model; returns (cameras, (P, 3) points)."""
+    """Writes a folder with `images/00.png` ... and a COLMAP model; returns (cameras, (P, 3) points)."""
     cameras = ring(count)
     names = [f"{i:02d}.png" for i in range(count)]
     (root / "images").mkdir(parents=True, exist_ok=True)

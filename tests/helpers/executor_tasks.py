@@ -1,4 +1,4 @@
-"""Tasks that the tests of executors hand to workers, which import this file by its name."""
+"""Tasks for the tests of executors. Workers import this file by its name."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from linprim_geo.base.files import write_json
 
 
 def is_alive(pid: int) -> bool:
+    """Returns whether a process runs; a zombie does not."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"
@@ -22,7 +23,7 @@ def is_alive(pid: int) -> bool:
 
 
 def chain(folder: Path, start: str, steps: int, seconds: float = 0.0) -> dict:
-    """A chain of digests, each of the one before, saved after every step and gone on with."""
+    """Computes a chain of digests, each of the previous one. Saves every step, and resumes from the last saved one."""
     file = folder / "chain.json"
     step, value = json.loads(file.read_text()) if file.exists() else (0, start)
     with open(folder / "attempts", "a") as log:
@@ -35,15 +36,17 @@ def chain(folder: Path, start: str, steps: int, seconds: float = 0.0) -> dict:
 
 
 def refuse(folder: Path) -> dict:
+    """Raises an error of this package."""
     raise LinprimError(f"{folder}: holds nothing, wanted something")
 
 
 def divide(folder: Path) -> dict:
+    """Raises an error that is not of this package."""
     return {"value": 1 // 0}
 
 
 def eat(folder: Path, gib: float) -> dict:
-    """Takes more memory than this process may have."""
+    """Limits the address space of this process, and allocates more memory than that."""
     import resource
 
     import numpy as np
@@ -53,7 +56,7 @@ def eat(folder: Path, gib: float) -> dict:
 
 
 def die(folder: Path, times: int) -> dict:
-    """Kills its own process so many times."""
+    """Kills its own process in the first `times` attempts."""
     with open(folder / "deaths", "a") as log:
         log.write("x")
     if (folder / "deaths").stat().st_size <= times:
@@ -62,7 +65,7 @@ def die(folder: Path, times: int) -> dict:
 
 
 def drive(shared: str, cluster: str, workers: str, seconds: str, count: str) -> None:
-    """A driver: `count` chains, its process to be killed."""
+    """Runs `count` chains with an executor and writes the results. The tests kill this process."""
     from linprim_geo.base.progress import Progress
     from linprim_geo.jobs.executor import Task
     from linprim_geo.jobs.open import open_executor

@@ -1,5 +1,5 @@
-"""Gradients against central differences, of all inputs and all outputs at once: each output needs no backward pass, and
-each input no difference, of its own."""
+"""Comparison of gradients with central differences. All inputs form one vector and all outputs another one, so that no
+output needs a backward pass and no input a difference of its own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ STEP, RTOL = 1e-6, 1e-5
 
 
 def flattened(run, inputs):
-    """(the function of one vector that holds all inputs whose value is one vector of all outputs, that vector)."""
+    """Returns `run` as a function from one vector of all inputs to one vector of all outputs, and the input vector."""
     shapes, sizes = [x.shape for x in inputs], [x.numel() for x in inputs]
 
     def of(vector):
@@ -20,14 +20,14 @@ def flattened(run, inputs):
 
 
 def assert_gradient_along_a_direction(run, inputs, atol: float) -> None:
-    """The derivative of random weights of all outputs along a random direction of all inputs."""
+    """Checks the derivative of a randomly weighted sum of all outputs along a random direction of all inputs."""
     of, vector = flattened(run, inputs)
     how = dict(eps=STEP, rtol=RTOL, atol=atol, check_undefined_grad=False, fast_mode=True)
     assert torch.autograd.gradcheck(of, (vector,), **how)
 
 
 def assert_every_gradient(run, inputs, atol: float) -> None:
-    """Every derivative of every output."""
+    """Checks the derivative of every output by every input."""
     of, vector = flattened(run, inputs)
     outputs = of(vector)
     (found,) = torch.autograd.grad(outputs, vector, torch.eye(len(outputs), dtype=outputs.dtype), is_grads_batched=True)

@@ -1,4 +1,5 @@
-"""Tasks done by this process, where what a worker process is does not matter: each of those loads all libraries."""
+"""An executor that runs tasks in this process, for tests that need no worker processes: each of those loads all
+libraries."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from linprim_geo.jobs.worker import run_task
 
 
 class Here(Executor):
-    """One task after the other, told and answered in JSON as by a worker. Takes the place of `open_executor`."""
+    """Runs tasks in order, with specification and result in JSON as for a worker. Replaces `open_executor`."""
 
     what = "this process"
 

@@ -1,8 +1,9 @@
-"""A process that has loaded the libraries and copies itself for every job, so that fifty of them can be started and
-killed in a minute.
+"""A server process that loads the libraries once and forks for every job, so that fifty jobs can be started and killed
+in a minute.
 
-Run as a program it reads one JSON object per line, {"call", "arguments", "delay", "at"}, and answers with one. A copy
-of itself does the call; after `delay` seconds, or in the middle of a write, it is killed, or with neither waited for.
+Run as a program, it reads one JSON object per line, {"call", "arguments", "delay", "at"}, and answers with one. A fork
+of it makes the call. The fork is killed after `delay` seconds, or at the write `at`; with neither, the server waits for
+its end.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", 
 
 
 class Jobs:
-    """Starts jobs and kills them. A context manager."""
+    """Starts the server, and lets it run and kill jobs. A context manager."""
 
     def __enter__(self) -> Jobs:
         self.process = subprocess.Popen(
@@ -37,13 +38,13 @@ class Jobs:
         self.process.wait()
 
     def run(self, call: str, *arguments, delay: float | None = None, at: tuple[int, int | None] | None = None) -> dict:
-        """`killed` (whether it was still at it), `seconds` that it ran, `error`, what it raised, and the `writes` of
-        one that came to its end: names of files beside or below its arguments that were opened for writing or renamed,
-        in order.
+        """Runs a job and returns `killed` (whether it was killed before its end), `seconds` that it ran, `error` (the
+        exception that it raised) and, if it was not killed, its `writes`: names of files beside or below its arguments
+        that were opened for writing or renamed, in order.
 
-        With `at` = (number, None) it kills itself with SIGKILL just before that one of its writes; with (number, bytes)
-        the system lets it write so many bytes into any file from then on, and ends it in the middle of the next write
-        beyond them.
+        With `at` = (number, None) the job kills itself with SIGKILL just before that write. With (number, bytes) it may
+        write at most that many bytes into any file from that write on; the system ends it in the middle of the first
+        write beyond.
         """
         job = {"call": call, "arguments": [str(x) for x in arguments], "delay": delay, "at": at}
         self.process.stdin.write(json.dumps(job) + "\n")
@@ -52,7 +53,7 @@ class Jobs:
 
 
 class Writes:
-    """Counts what a process writes, in Python's own words, and ends it at one of them."""
+    """Counts the writes of a process by an audit hook of Python, and ends the process at one of them."""
 
     def __init__(self, folders: list[str], at: tuple[int, int | None] | None):
         self.folders, self.at, self.names = tuple(folder + os.sep for folder in folders), at, []
@@ -76,6 +77,7 @@ class Writes:
 
 
 def train(scene: str, run: str, options: str, resume: str) -> None:
+    """Trains a scene; `options` is JSON."""
     from linprim_geo.base.options import TrainOptions
     from linprim_geo.training.train import train
 
@@ -83,22 +85,25 @@ def train(scene: str, run: str, options: str, resume: str) -> None:
 
 
 def extract(run: str, output: str) -> None:
+    """Extracts the mesh of a run."""
     from linprim_geo.base.options import ExtractOptions
     from linprim_geo.surface.extract import extract_mesh
 
-    # What is only computed in memory is left out: it would be most of the time.
+    # Steps that only compute in memory are off: they would take most of the time.
     options = ExtractOptions(level=0.5, stereo="off", refine=0, denoise="off")
     extract_mesh(run, output=output, options=options, quiet=True)
 
 
 def convert(source: str, target: str) -> None:
+    """Converts a file of primitives or of a mesh."""
     from linprim_geo.surface.convert import convert
 
     convert(source, target)
 
 
 def _serve() -> None:
-    # None of these starts a thread, which would not survive being copied.
+    """Reads jobs from stdin and answers them, until stdin is closed."""
+    # None of these starts a thread: threads do not survive a fork.
     import open3d  # noqa: F401
     import PIL.ImageOps  # noqa: F401
     import PIL.PngImagePlugin  # noqa: F401
@@ -114,7 +119,7 @@ def _serve() -> None:
     import linprim_geo.training.train  # noqa: F401
 
     answers = os.dup(1)
-    os.dup2(2, 1)  # what libraries print is no answer
+    os.dup2(2, 1)  # output of libraries goes to stderr, as stdout is for answers
     for line in sys.stdin:
         job = json.loads(line)
         reader, writer = os.pipe()
@@ -123,13 +128,13 @@ def _serve() -> None:
         if child == 0:
             said, silence = "", os.open(os.devnull, os.O_WRONLY)
             os.dup2(silence, 1)
-            os.dup2(silence, 2)  # a file perhaps, which is not to count as one that is written
-            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # ends it, without a core file
+            os.dup2(silence, 2)  # stderr may be a file; writes to it would count for RLIMIT_FSIZE
+            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # ends the process, without a core file
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             writes = Writes([os.path.dirname(path) for path in job["arguments"] if os.path.isabs(path)], job["at"])
             try:
                 globals()[job["call"]](*job["arguments"])
-            except BaseException as error:  # noqa: BLE001 - it is told
+            except BaseException as error:  # noqa: BLE001 - it is reported
                 said = f"{type(error).__name__}: {error}"
             os.write(writer, json.dumps([said, writes.names]).encode())
             os._exit(0)

@@ -1,4 +1,5 @@
-"""Scenes of every variant of the compiled rasterizer, and tests of all of them: primitive, ray model and order."""
+"""Scenes for every variant of the compiled rasterizer (primitive, ray model, order), and the parametrisation of tests
+over them."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ DTYPES = [torch.float32, torch.float64]
 
 
 def ladder(variants, dtypes=None):
-    """Parametrises a test over variants and scalars."""
+    """Parametrises a test over variants and, if given, scalar types."""
     if dtypes is None:
         return pytest.mark.parametrize("variant", variants, ids=["-".join(r) for r in variants])
     cases = list(itertools.product(variants, dtypes))
@@ -26,11 +27,12 @@ def ladder(variants, dtypes=None):
 
 
 def options_of(variant) -> dict:
+    """Returns the options of `rasterize` for a variant."""
     return dict(zip(("primitive", "ray_model", "order"), variant, strict=True))
 
 
 def scene_of(variant, seed, count=8, coefficients=1, **camera):
-    """An ordinary scene of a variant's primitive in float64, and its camera."""
+    """Returns an ordinary random scene of a variant's primitive in float64, and its camera."""
     parameters, view = random_scene(seed, count, coefficients, **camera)
     rng = np.random.default_rng(seed)
     if variant[0] == "tetrahedron":

@@ -1,4 +1,4 @@
-"""A wall without texture by the light of a lamp: analytic photographs with noise, and its true depth."""
+"""A wall without texture, lit by a lamp: analytic photographs with noise, and their true depths."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from helpers.captures import look_at
 
 from linprim_geo.stereo.depth_maps import DepthMap
 
-# A wall y = 0, seen from an arc before it; a lamp near its left upper corner.
+# The wall y = 0, a lamp near its upper left corner, the noise of grey values, and camera centres on an arc before it.
 WALL, LAMP, NOISE = np.array([0.0, 1.0, 0.0, 0.0]), np.array([-0.9, 0.7, 0.8]), 2.0
 CENTERS = [(2 * np.sin(angle), 2 * np.cos(angle), 0.2) for angle in np.radians(np.linspace(-35, 35, 9))]
 
@@ -17,7 +17,7 @@ def camera_at(center):
 
 
 def wall_depth(camera, bulge: float = 0.0) -> np.ndarray:
-    """(H, W) depth of the wall, or of one that comes forward by `bulge` in the middle, as a parabola."""
+    """Returns the (H, W) depth of the wall, which a parabola moves forward by `bulge` in the middle."""
     rays = camera.world_rays()
     depth = -camera.center[1] / rays[..., 1]
     for _ in range(20 if bulge else 0):
@@ -27,13 +27,14 @@ def wall_depth(camera, bulge: float = 0.0) -> np.ndarray:
 
 
 def light(points: np.ndarray) -> np.ndarray:
-    """Grey values of a white wall by the lamp's light, as displays show it."""
+    """Returns the grey values of a white wall in the lamp's light, with a display's gamma of 2.2."""
     towards = LAMP - points
     square = (towards**2).sum(-1)
     return 255 * np.clip(0.55 * towards[..., 1] / square**1.5, 0, 1) ** (1 / 2.2)
 
 
 def map_of(camera, grey: np.ndarray, seed: int, noise: float = NOISE) -> DepthMap:
+    """Returns a view without depths; `grey` gets noise."""
     noisy = grey + np.random.default_rng(seed).normal(0, noise, grey.shape)
     nothing = np.full(grey.shape, np.nan, np.float32)
     none = np.zeros(grey.shape, np.uint8)
@@ -50,7 +51,7 @@ def map_of(camera, grey: np.ndarray, seed: int, noise: float = NOISE) -> DepthMa
 
 
 def photographs(value, bulge: float = 0.0, seed: int = 0, noise: float = NOISE):
-    """Maps of all cameras with the grey values `value`(points, view), and the true depths."""
+    """Returns the maps of all cameras with the grey values `value`(points, view), and the true depths."""
     maps, depths = [], []
     for view, center in enumerate(CENTERS):
         camera = camera_at(center)

@@ -1,4 +1,4 @@
-"""Scenes of octahedra for the tests of the compiled rasterizer, and its comparison with the float64 twin."""
+"""Scenes of octahedra for the tests of the compiled rasterizer, and comparison with its float64 reference, the twin."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ C0 = 0.28209479177387814  # the spherical harmonic of degree 0
 
 
 def available_kernels() -> list[str]:
-    """Names of the instruction sets that this processor can run."""
+    """Returns the names of the instruction sets that this processor can run."""
     before, found = ops.instruction_set(), []
     for name in ("scalar", "v2", "v3", "v4", "neon"):
         try:
@@ -33,13 +33,13 @@ def available_kernels() -> list[str]:
 
 
 KERNELS = available_kernels()
-# Every build of the kernels: double precision has the scalar one only.
+# Every build of the kernels; in double precision there is only the scalar one.
 BUILDS = [("float64", "scalar"), *(("float32", name) for name in KERNELS)]
 
 
 @contextmanager
 def kernels(name: str, threads: int | None = None):
-    """The core with the vector kernels `name` and a number of threads; as before afterwards."""
+    """Selects the kernels `name` and a number of threads, and restores the previous ones afterwards."""
     before = ops.instruction_set(), ops.threads()
     ops.set_instruction_set(name)
     if threads is not None:
@@ -50,7 +50,7 @@ def kernels(name: str, threads: int | None = None):
 
 
 def octahedra(center, extent, density, rotation=None, sh=None, background=(0.2, 0.5, 0.1)) -> list[torch.Tensor]:
-    """The six float64 tensors of `rasterize` from lists; each primitive has a colour of its own."""
+    """Returns the six float64 tensors of `rasterize` from lists; primitives have different colours by default."""
     n = len(center)
     shades = [[[0.9 - 0.3 * (i % 3), 0.2 + 0.5 * (i % 2), -0.4 + 0.4 * (i % 4)]] for i in range(n)]
     values = (center, rotation or [IDENTITY] * n, extent, density, sh or shades, background)
@@ -58,14 +58,14 @@ def octahedra(center, extent, density, rotation=None, sh=None, background=(0.2, 
 
 
 def camera(width=17, height=13, focal=None, pose=None, cx=None, cy=None) -> Camera:
-    """A camera whose pixels meet no symmetry of a scene on its axis."""
+    """Returns a camera whose pixel centres avoid the symmetries of a scene on its axis."""
     focal = focal or 1.2 * max(width, height)
     cx, cy = width / 2 + 0.137 if cx is None else cx, height / 2 - 0.219 if cy is None else cy
     return Camera(width, height, focal, 1.07 * focal, cx, cy, np.eye(4) if pose is None else pose)
 
 
 def random_pose(rng, shift=1.0) -> np.ndarray:
-    """A rigid world-to-camera matrix."""
+    """Returns a random rigid world-to-camera matrix."""
     pose = np.eye(4)
     pose[:3, :3] = reference.rotation_matrix(torch.from_numpy(rng.normal(size=4))).numpy()
     pose[:3, 3] = shift * rng.normal(size=3)
@@ -73,12 +73,12 @@ def random_pose(rng, shift=1.0) -> np.ndarray:
 
 
 def to_world(center: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Camera-space points (N, 3) in the world."""
+    """Transforms camera-space points (N, 3) to the world."""
     return (center - pose[:3, 3]) @ pose[:3, :3]
 
 
 def random_scene(seed, count, coefficients=4, width=17, height=13, depth=3.0, spread=0.7, focal=None):
-    """Overlapping octahedra of any shape before a camera of any pose: half-axes 0.1 to 1.5, density 0.1 to 20."""
+    """Returns overlapping random octahedra (half-axes 0.1 to 1.5, density 0.1 to 20) and a camera of random pose."""
     rng = np.random.default_rng(seed)
     pose = random_pose(rng)
     center = to_world(spread * rng.normal(size=(count, 3)) * [1, 1, 1.5] + [0, 0, depth], pose)
@@ -89,8 +89,8 @@ def random_scene(seed, count, coefficients=4, width=17, height=13, depth=3.0, sp
 
 
 def hard_scene(seed):
-    """1 to 8 octahedra with half-axes 1e-6 to 1e3, alignments, coincidences and extreme views; its camera and
-    options."""
+    """Returns 1 to 8 octahedra with half-axes 1e-6 to 1e3, alignments and coincidences, a camera that may be extreme,
+    and options of `rasterize`."""
     rng = np.random.default_rng(seed)
 
     def now_and_then(share):
@@ -119,7 +119,7 @@ def hard_scene(seed):
     if now_and_then(0.1):
         center[0] = 0
     if now_and_then(0.3):
-        density = 10 ** rng.uniform(-6, 6, n) / extent.min(1)  # from nothing to a thickness of a million
+        density = 10 ** rng.uniform(-6, 6, n) / extent.min(1)  # optical thickness from almost 0 to a million
     if now_and_then(0.1):
         density[:] = 0
     if now_and_then(0.1):
@@ -143,12 +143,12 @@ def hard_scene(seed):
 
 
 def leaves(parameters, dtype=None) -> list[torch.Tensor]:
-    """Copies of the tensors that want a gradient."""
+    """Returns copies of the tensors that require a gradient."""
     return [p.detach().to(dtype or p.dtype).clone().requires_grad_() for p in parameters]
 
 
 def twin(parameters, view: Camera, **options) -> dict[str, torch.Tensor]:
-    """`reference.rasterize` of the same scene in float64."""
+    """Renders the same scene with `reference.rasterize` in float64."""
     return reference.rasterize(
         *[p.double() for p in parameters],
         world_to_camera=torch.from_numpy(view.world_to_camera),
@@ -163,18 +163,18 @@ def twin(parameters, view: Camera, **options) -> dict[str, torch.Tensor]:
 
 
 def fields(rendering: ops.Rendering, names=IMAGES) -> dict[str, torch.Tensor]:
-    """The named images of a rendering."""
+    """Returns the named images of a rendering."""
     return {name: getattr(rendering, name) for name in names}
 
 
 def cotangents(images: dict[str, torch.Tensor], seed=0) -> dict[str, torch.Tensor]:
-    """Fixed random weights, one for each value of each image."""
+    """Returns fixed random weights, one for each value of each image."""
     generator = torch.Generator().manual_seed(seed)
     return {k: torch.randn(v.shape, generator=generator, dtype=torch.float64) for k, v in images.items()}
 
 
 def gradients(images, inputs, weights) -> list[torch.Tensor]:
-    """Gradient of the weighted sum of the images to the inputs; zeros where there is none."""
+    """Returns the gradients of the weighted sum of the images by the inputs; zeros where there is none."""
     total = sum((image * weights[name].to(image.dtype)).sum() for name, image in images.items())
     if not total.requires_grad:
         return [torch.zeros_like(x) for x in inputs]
@@ -183,7 +183,7 @@ def gradients(images, inputs, weights) -> list[torch.Tensor]:
 
 
 def everything(parameters, view: Camera, geometry=True, **options) -> list[torch.Tensor]:
-    """All outputs and all gradients of one rendering, for comparisons bit by bit."""
+    """Returns all outputs and all gradients of one rendering, for comparisons bit by bit."""
     inputs = leaves(parameters)
     screen = torch.zeros(len(inputs[0]), 3, dtype=inputs[0].dtype, requires_grad=True)
     out = ops.rasterize(*inputs, view, geometry=geometry, screen=screen, **options)
@@ -194,7 +194,7 @@ def everything(parameters, view: Camera, geometry=True, **options) -> list[torch
 
 
 def assert_identical(a, b):
-    """Bit by bit, NaN equal to itself."""
+    """Checks that tensors have equal shapes and values, with NaN equal to itself."""
     assert len(a) == len(b)
     for i, (x, y) in enumerate(zip(a, b, strict=True)):
         same = (x == y) | (x.isnan() & y.isnan()) if x.is_floating_point() else x == y

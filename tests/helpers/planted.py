@@ -1,4 +1,4 @@
-"""Modules that a downloaded capture may hold beside its photographs."""
+"""Python modules that a malicious capture may hold beside its photographs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ NAMES = ("json", "logging", "numpy", "random", "sitecustomize", "socket", "torch
 
 
 def plant_modules(folder: Path) -> None:
-    """Modules with the names of libraries, which write the file `imported` into their folder if they are."""
+    """Writes modules with the names of libraries. If one is imported, it writes the file `imported` into the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     witness = str(folder / "imported")
     for name in NAMES:

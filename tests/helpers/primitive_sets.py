@@ -1,4 +1,4 @@
-"""Random primitives of every kind, and PLY files of them byte by byte."""
+"""Random primitives of every kind, and the bytes of PLY files in LinPrim's format."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PROPERTIES = (
 
 
 def random_octahedra(count=50, coefficients=9, seed=0, thickness=None):
-    """Primitives of any shape; `thickness` is the optical thickness of their shortest diagonals."""
+    """Returns random octahedra; `thickness` is the optical thickness of their shortest diagonals."""
     rng = np.random.default_rng(seed)
     extent = np.exp(rng.normal(-2, 1, (count, 3))).astype(np.float32)
     thickness = np.exp(rng.uniform(-7, 1.5, count)) if thickness is None else np.full(count, thickness)
@@ -32,7 +32,7 @@ def random_octahedra(count=50, coefficients=9, seed=0, thickness=None):
 
 
 def random_tetrahedra(count=50, coefficients=9, seed=0, thickness=None):
-    """Tetrahedra of any shape; `thickness` is that of the diameters of their inscribed spheres."""
+    """Returns random tetrahedra; `thickness` is the optical thickness of the diameters of their inscribed spheres."""
     rng = np.random.default_rng(seed)
     extent = np.exp(rng.normal(-2, 1, (count, 4))).astype(np.float32)
     thickness = np.exp(rng.uniform(-7, 1.5, count)) if thickness is None else np.full(count, thickness)
@@ -47,6 +47,7 @@ def random_tetrahedra(count=50, coefficients=9, seed=0, thickness=None):
 
 
 def random_gaussians(count=50, coefficients=9, seed=0):
+    """Returns random Gaussians."""
     rng = np.random.default_rng(seed)
     return Primitives(
         center=rng.normal(size=(count, 3)),
@@ -59,7 +60,7 @@ def random_gaussians(count=50, coefficients=9, seed=0):
 
 
 def raw_table(count=4, seed=1):
-    """Rows as LinPrim writes them: raw distances of either sign, quaternions of any length, a filter."""
+    """Returns rows as LinPrim writes them: raw distances of either sign, quaternions of any length, a filter."""
     rng = np.random.default_rng(seed)
     table = np.zeros(count, dtype=[(name, "<f4") for name in PROPERTIES])
     for name in PROPERTIES:
@@ -70,6 +71,7 @@ def raw_table(count=4, seed=1):
 
 
 def ply_bytes(table, header_changes=()):
+    """Returns a binary PLY file of the table; `header_changes` are (old, new) replacements in its header."""
     kinds = {"f4": "float", "f8": "double", "i4": "int"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     lines += [f"property {kinds[table.dtype[name].str[1:]]} {name}" for name in table.dtype.names]

@@ -1,4 +1,4 @@
-"""Scenes of every primitive for the torch twin, and the variants of its ladder: primitive, ray model and order."""
+"""Scenes of every primitive for the torch reference (the twin), and its variants: primitive, ray model and order."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BASIS = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt
 
 
 def scene(primitive, seed, count, coefficients=4, **more):
-    """`random_scene` of any primitive."""
+    """Returns a `random_scene` with primitives of this kind, and its camera."""
     parameters, camera = random_scene(seed, count, coefficients, **more)
     g = torch.Generator().manual_seed(1000 + seed)
     uniform = torch.rand(count, 5, generator=g, dtype=torch.float64)
@@ -28,4 +28,5 @@ def scene(primitive, seed, count, coefficients=4, **more):
 
 
 def pixel_of(result, row, column):
+    """Returns the values of one pixel of all images."""
     return {name: value[..., row, column] for name, value in result.items() if value.ndim > 1}

@@ -1,4 +1,4 @@
-"""Scenes and cameras for the torch twin, and how its images are compared."""
+"""Scenes and cameras for the torch reference (the twin), and the comparison of its images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGES = (
 LENGTHS = {"depth_expected": 1, "depth_median": 1, "depth_first": 1, "distortion": 2}
 C0 = 0.28209479177387814
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-# Double arithmetic on numbers of order 1 to 10, some hundred operations, several of which cancel a digit.
+# Tolerance for float64: some hundred operations on numbers of order 1 to 10, several of which cancel a digit.
 EXACT = dict(rtol=1e-11, atol=1e-12)
 
 
@@ -28,12 +28,12 @@ def tensor(values, dtype=torch.float64):
 
 
 def gray(level):
-    """Coefficients (1, 3) of degree 0 whose colour is `level`."""
+    """Returns the spherical harmonics coefficients (1, 3) of degree 0 of the grey `level`."""
     return [[(level - 0.5) / C0] * 3]
 
 
 def octahedra(center, extent, density, color=None, rotation=None, background=(0.0, 0.0, 0.0)):
-    """The six tensors of `rasterize` from lists; identity rotation and a gray of 1 unless told."""
+    """Returns the six tensors of `rasterize` from lists; by default without rotation, and with a grey of 1."""
     n = len(center)
     rotation = rotation or [IDENTITY] * n
     sh = [gray(c) for c in (color or [1.0] * n)]
@@ -41,7 +41,7 @@ def octahedra(center, extent, density, color=None, rotation=None, background=(0.
 
 
 def axis_camera(width=9, height=9, focal=8.0, **more):
-    """At the origin, looking along +z, with the middle pixel's centre exactly on the axis."""
+    """Returns a camera at the origin that looks along +z, with the middle pixel's centre exactly on the axis."""
     return (
         dict(
             world_to_camera=torch.eye(4, dtype=torch.float64),
@@ -64,7 +64,7 @@ def random_pose(generator):
 
 
 def random_scene(seed, count, coefficients=4, width=6, height=5, depth=3.0, spread=0.5, **more):
-    """Overlapping octahedra of any shape before a camera of any pose, with their camera."""
+    """Returns overlapping random octahedra and a camera of random pose that looks at them."""
     g = torch.Generator().manual_seed(seed)
 
     def normal(*shape):

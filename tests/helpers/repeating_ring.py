@@ -1,5 +1,5 @@
-"""Matches of photographs in which some things look the same, as a pycolmap database: 24 cameras in a ring look out at
-a wall of points, and each of some patches of points is there twice."""
+"""A pycolmap database of matches between photographs of a scene with repeated structure: 24 cameras in a ring look
+outward at a wall of points, on which some patches of points occur twice."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def write_matches(database_path: Path, patches: int, seed: int) -> list[np.ndarr
 
 
 def _pose(rng: np.random.Generator, angle: float) -> np.ndarray:
-    """Of a camera that looks out from the ring, from world to camera."""
+    """Returns the (3, 4) world-to-camera pose of a camera that looks outward from the ring."""
     out = np.array([np.cos(angle), np.sin(angle), 0])
     down = np.array([0, 0, -1.0])
     rotation = Rotation.from_rotvec(rng.normal(0, 0.05, 3)).as_matrix() @ np.array([np.cross(down, out), down, out])
@@ -60,7 +60,7 @@ def _pose(rng: np.random.Generator, angle: float) -> np.ndarray:
 
 
 def _points(rng: np.random.Generator, patches: int) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 3) points and (N,) numbers; those with the same look the same."""
+    """Returns (N, 3) points and (N,) numbers of their looks; points of the same number look the same."""
     angle = rng.uniform(0, 2 * np.pi, _POINTS)
     wall = np.stack([np.cos(angle), np.sin(angle)], 1) * rng.uniform(3, 4.5, (_POINTS, 1))
     points, looks = [np.column_stack([wall, rng.uniform(-1.2, 1.2, _POINTS)])], [np.arange(_POINTS)]
@@ -76,7 +76,8 @@ def _points(rng: np.random.Generator, patches: int) -> tuple[np.ndarray, np.ndar
 def _photograph(
     rng: np.random.Generator, pose: np.ndarray, points: np.ndarray, looks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(K, 2) keypoints and how they look; what is twice in the photograph cannot be matched."""
+    """Returns (K, 2) keypoints and the numbers of their looks. Points whose look occurs twice in the photograph are
+    left out, as they cannot be matched."""
     local = points @ pose[:, :3].T + pose[:, 3]
     pixels = FOCAL * local[:, :2] / local[:, 2:] + np.array(SIZE) / 2
     seen = np.flatnonzero((local[:, 2] > 0.1) & (pixels > 0).all(1) & (pixels < SIZE).all(1))

@@ -1,4 +1,4 @@
-"""Triangulated shapes whose distances are known, and a camera above them."""
+"""Triangulated shapes with known distances, and a camera above them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from linprim_geo.eval.surface_samples import refine
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 
-# What others rely on finding in the scores of a mesh: the scores, and what they were made with.
+# Keys that users of the scores of a mesh rely on: the scores, and the settings that they were computed with.
 SCORES = {
     *("accuracy", "completeness", "chamfer", "precision", "recall", "f1", "normal_consistency", "hausdorff"),
     "standard_error",
@@ -19,7 +19,7 @@ CONTEXT = {"protocol", "unit", "tau", "samples", "seed", "seconds"}
 
 
 def grid(columns=4, rows=3, size=(2.0, 1.0), height=0.0):
-    """A rectangle from the origin, facing +z, cut into columns x rows x 2 triangles."""
+    """Returns a rectangle with a corner at the origin, facing +z, cut into columns x rows x 2 triangles."""
     x, y = np.meshgrid(np.linspace(0, size[0], columns + 1), np.linspace(0, size[1], rows + 1))
     vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1)
     a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
@@ -28,7 +28,7 @@ def grid(columns=4, rows=3, size=(2.0, 1.0), height=0.0):
 
 
 def sphere(radius=1.0, rounds=3, center=(0.0, 0.0, 0.0)):
-    """An octahedron whose faces are split into four `rounds` times, every vertex moved onto the sphere."""
+    """Returns an octahedron whose faces are split into four `rounds` times, with all vertices moved onto the sphere."""
     vertices = np.concatenate([np.eye(3), -np.eye(3)])
     faces = np.array([(a, b, c) for a in (0, 3) for b in (1, 4) for c in (2, 5)])
     outward = np.linalg.det(vertices[faces]) > 0
@@ -40,32 +40,36 @@ def sphere(radius=1.0, rounds=3, center=(0.0, 0.0, 0.0)):
 
 
 def inradius(mesh):
-    """Smallest distance of the origin from a face: the faceted sphere lies between it and its radius."""
+    """Returns the smallest distance of the origin from a face's plane: a triangulated sphere lies between it and the
+    radius."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     return float((np.einsum("ij,ij->i", normal, a) / np.linalg.norm(normal, axis=1)).min())
 
 
 def wavy():
-    """An open surface whose distance to the rectangle below it varies from place to place."""
+    """Returns an open surface whose distance to the rectangle below it varies."""
     mesh = grid(30, 20)
     x, y, _ = mesh.vertices.T
     return replace(mesh, vertices=np.stack([x, y, 0.05 * np.sin(7 * x) * np.cos(5 * y) + 0.02 * x], 1))
 
 
 def join(*meshes):
+    """Returns one mesh of several."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + offset for mesh, offset in zip(meshes, offsets[:-1], strict=True)]
     return Mesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces))
 
 
 def rotation(seed=0):
+    """Returns a random rotation matrix."""
     q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((3, 3)))
     q = q * np.sign(np.diag(r))
     return q * np.sign(np.linalg.det(q))
 
 
 def camera_above(height, focal=100.0, target=(0.0, 0.0)):
+    """Returns a camera of 200 x 200 pixels that looks straight down at `target`."""
     pose = np.eye(4)
     pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
     pose[:3, 3] = -pose[:3, :3] @ np.array([*target, height])
@@ -73,12 +77,12 @@ def camera_above(height, focal=100.0, target=(0.0, 0.0)):
 
 
 def edge_uses(faces: np.ndarray) -> np.ndarray:
-    """Of each edge of (M, 3) faces, how many of them use it."""
+    """Returns for each edge of (M, 3) faces the number of faces that have it."""
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(edges[:, 0] * (faces.max() + 1) + edges[:, 1], return_counts=True)[1]
 
 
 def areas(vertices, faces):
-    """(F,) areas of triangles."""
+    """Returns the (F,) areas of triangles."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)

@@ -1,4 +1,4 @@
-"""The textured plane z = 0, photographs of it that are known exactly, and meshes near it."""
+"""The textured plane z = 0, analytic photographs of it, and meshes near it."""
 
 from __future__ import annotations
 
@@ -21,17 +21,19 @@ def camera(eye):
 
 
 def ring(count=8, slant=0.8):
+    """Returns cameras on a ring above the plane that look at the origin."""
     angles = 2 * np.pi * np.arange(count) / count
     return [camera((slant * np.cos(a) * DISTANCE, slant * np.sin(a) * DISTANCE, DISTANCE)) for a in angles]
 
 
 def texture(x, y):
-    """Brightness of the plane z = 0, 0 to 1, with waves of four to eight footprints."""
+    """Returns the brightness of the plane z = 0, 0 to 1, with waves of four to eight footprints."""
     waves = np.sin(40 * x + 9 * y) + np.sin(31 * y - 14 * x) + np.sin(22 * (x + y))
     return 0.5 + 0.15 * waves
 
 
 def photograph(view, paint=texture):
+    """Returns the photograph of the plane by a camera; `paint`(x, y) is its brightness."""
     rays = view.world_rays()
     hit = view.center - rays * (view.center[2] / rays[..., 2])[..., None]
     value = np.round(255 * np.clip(paint(hit[..., 0], hit[..., 1]), 0, 1)).astype(np.uint8)
@@ -39,7 +41,7 @@ def photograph(view, paint=texture):
 
 
 class Shown:
-    """A view of the plane."""
+    """A view of the plane: its camera and photograph."""
 
     def __init__(self, view, paint=texture):
         self.camera, self.photo = view, photograph(view, paint)
@@ -49,7 +51,7 @@ class Shown:
 
 
 def sheet(height, reach=0.5, steps=41):
-    """A grid of the height (x, y) -> z, its front upwards."""
+    """Returns the graph of `height`(x, y) as a grid of triangles that face upward."""
     line = np.linspace(-reach, reach, steps)
     x, y = np.meshgrid(line, line, indexing="ij")
     k = np.arange(steps * steps).reshape(steps, steps)
@@ -60,4 +62,5 @@ def sheet(height, reach=0.5, steps=41):
 
 
 def inner(mesh, reach=0.4):
+    """Marks the vertices less than `reach` from the origin in x and y."""
     return (np.abs(mesh.vertices[:, :2]) < reach).all(1)

@@ -1,5 +1,4 @@
-"""Photographs of a cubic room seen from inside, with a texture that keypoints are found on and cameras known
-exactly."""
+"""Photographs of a cubic room seen from inside, with a texture for keypoint detection and exactly known cameras."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ HALF = 2.0  # half the side of the room
 
 
 def wall_texture(points: np.ndarray) -> np.ndarray:
-    """(..., 3) colours in [0, 255] of points: smooth value noise of three scales, the same for every view."""
+    """Returns (..., 3) colours in [0, 255] of points: smooth value noise of three scales, the same for every view."""
     grid = np.random.default_rng(11).uniform(0, 1, (3, 33, 33, 33, 3))
     out = np.zeros(points.shape)
     for octave, (frequency, weight) in enumerate(((3.0, 0.5), (7.0, 0.3), (15.0, 0.2))):
@@ -24,7 +23,7 @@ def wall_texture(points: np.ndarray) -> np.ndarray:
 
 
 def photograph(camera) -> np.ndarray:
-    """What the camera sees of the room from inside, 2 x 2 samples per pixel."""
+    """Renders the room as seen by the camera from inside, with 2 x 2 samples per pixel."""
     total = np.zeros((camera.height, camera.width, 3))
     for dx in (-0.25, 0.25):
         for dy in (-0.25, 0.25):
