@@ -1,6 +1,6 @@
-"""Scores of a run: surfaces, depth and normals against truth, renders against held-out photographs.
+"""Scores of a run: surfaces, depth and normals against a reference, renders against held-out photographs.
 
-Here: opening a run, choosing its views, writing `results.json` and `per_view.csv`.
+This module opens a run, chooses its views, and writes `results.json` and `per_view.csv`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ SPLITS = ("test", "train", "all")
 
 
 def write_results(folder: str | os.PathLike, results: Mapping, rows: Sequence[Mapping] | None = None) -> None:
-    """Writes `results.json` and, where there are rows, one line for each to `per_view.csv`, into `folder`.
+    """Write `results.json`, and `per_view.csv` with one line per row if there are rows, into `folder`.
 
-    NaN and infinity become null in the JSON, and stay `nan` and `inf` in the CSV. Both files are replaced
-    atomically; the columns of the CSV are the keys of the first row.
+    NaN and infinity become null in the JSON and stay `nan` and `inf` in the CSV. Both files are replaced
+    atomically. The columns of the CSV are the keys of the first row.
 
     Raises:
         LinprimError: the folder cannot be written.
     """
-    # Here, so that the command line can read the options of this package without other libraries.
+    # Imported here, so that the command line can read the options of this package without other libraries.
     from linprim_geo.base.files import atomic_write, write_json
 
     folder = Path(folder)
@@ -38,7 +38,7 @@ def write_results(folder: str | os.PathLike, results: Mapping, rows: Sequence[Ma
 
 
 def open_run(run):
-    """Returns `run` itself if it is already open, else opens the run folder of that path."""
+    """Return `run` itself if it is already open, else open the run folder at that path."""
     if isinstance(run, (str, os.PathLike)):
         from linprim_geo.runs.run import Run
 
@@ -47,10 +47,10 @@ def open_run(run):
 
 
 def views_of(scene, split: str) -> tuple:
-    """The views of `scene` in `split` ("test", "train" or "all").
+    """Return the views of `scene` in `split` ("test", "train" or "all").
 
     Raises:
-        LinprimError: the split has another name, or no view is in it.
+        LinprimError: `split` is unknown, or has no views.
     """
     if split not in SPLITS:
         raise LinprimError(f"split '{split}' is unknown; expected one of {', '.join(SPLITS)}")

@@ -1,4 +1,4 @@
-"""Brings a mesh to where a reference lies before it is scored, where the two are not in one frame."""
+"""Registration of a mesh to a reference in another frame, before it is scored."""
 
 from __future__ import annotations
 
@@ -12,32 +12,35 @@ from linprim_geo.eval.surface_samples import PointDistance, SurfaceDistance, sam
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_normals
 
-# Points of each side, in a search over starts and at the end.
+# Points sampled on each side: in the search over starts, and in the final registration.
 FEW, MANY = 1000, 20_000
-# Share of the points of each side that count, the nearest ones: what one side alone has is no reason to move.
+# Share of the points of each side that are used, those with the smallest distances. It leaves out parts that only one
+# side has.
 KEPT = 0.9
-# Steps at most, and the size of one, as a share of the reference's size, after which no more are made.
+# Largest numbers of steps, of the final registration and of the search over starts; and the size of a step, as a share
+# of the reference's size, below which the iteration ends.
 STEPS, FEW_STEPS, SMALLEST_STEP = 60, 12, 1e-9
 
 
 @dataclass(frozen=True)
 class Motion:
-    """x_out = scale * rotation @ x_in + offset."""
+    """A similarity transform: x_out = scale * rotation @ x_in + offset."""
 
     scale: float
     rotation: np.ndarray
     offset: np.ndarray
 
     def apply(self, points: np.ndarray) -> np.ndarray:
-        """Maps (..., 3) points."""
+        """Return (..., 3) points after the transform."""
         return self.scale * (points @ self.rotation.T) + self.offset
 
     def undo(self, points: np.ndarray) -> np.ndarray:
-        """The points (..., 3) that `apply` maps to these."""
+        """Return (..., 3) points after the inverse transform."""
         return (points - self.offset) @ self.rotation / self.scale
 
     def moved(self, camera: Camera) -> Camera:
-        """The camera that sees of a moved scene what `camera` sees of the scene; depths are multiplied by `scale`."""
+        """Return the camera whose image of the transformed scene equals the image of the original scene in `camera`;
+        its depths are `scale` times larger."""
         pose = np.eye(4)
         pose[:3, :3] = camera.rotation @ self.rotation.T
         pose[:3, 3] = -pose[:3, :3] @ self.apply(camera.center)
@@ -45,15 +48,17 @@ class Motion:
 
 
 def align(prediction: Mesh, reference: Mesh | np.ndarray, way: str, seed: int = 0) -> tuple[Motion, dict]:
-    """The motion that brings a clean mesh to a clean mesh, or to (P, 3) points, and what there is to say of it.
+    """Register a clean mesh to a clean mesh or to (P, 3) points.
 
-    "icp" turns and moves it, from where it lies; "similarity" also finds the scale, and begins from 24 turns of the
-    principal axes as well, so that the two may be in frames that have nothing to do with each other. Both take steps of
-    Gauss and Newton on the distances along the mesh's normals, of points of either side to the other one, of which the
-    nearest KEPT count (Chen and Medioni, Object modelling by registration of multiple range images, 1992).
+    "icp" finds rotation and translation, starting from the mesh's pose. "similarity" also finds the scale, and starts
+    from 24 alignments of the principal axes as well, so the two frames may be unrelated. Both are iterative
+    closest-point methods with Gauss-Newton steps on point-to-plane distances along the mesh's normals, in both
+    directions, of which the smallest share KEPT is used (Chen and Medioni, Object modelling by registration of multiple
+    range images, 1992).
 
-    Returns: the motion, and `way`, `scale`, `turned_degrees`, `moved` (of the mesh's centre), `matrix` (4 rows),
-        `distance_before` and `distance_after` (mean of the points that count), `starts` and `steps`.
+    Returns: the transform, and a dict with `way`, `scale`, `turned_degrees`, `moved` (distance of the centre of the
+        mesh's bounding box), `matrix` (4 rows), `distance_before` and `distance_after` (mean over the points used),
+        `starts` and `steps`.
     """
     pair = _Pair(prediction, reference, seed)
     still = Motion(1.0, np.eye(3), np.zeros(3))
@@ -64,7 +69,7 @@ def align(prediction: Mesh, reference: Mesh | np.ndarray, way: str, seed: int = 
         begin = min(rough, key=lambda found: found[1])[0]
     motion, after, steps = pair.settled(begin, MANY, STEPS, scaled=way == "similarity")
     before = pair.step(still, MANY, False)[1]
-    if after > before:  # it lay as well as it can
+    if after > before:  # the registration has improved nothing
         motion, after = still, before
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = motion.scale * motion.rotation, motion.offset
@@ -84,7 +89,7 @@ def align(prediction: Mesh, reference: Mesh | np.ndarray, way: str, seed: int = 
 
 
 def in_words(about: dict) -> str:
-    """One line of what `align` has done."""
+    """Return one line of text that describes the result of `align`."""
     return (
         f"aligned by {about['way']}: scaled by {about['scale']:.6g}, turned by {about['turned_degrees']:.4g} degrees, "
         f"moved by {about['moved']:.4g}; mean distance {about['distance_before']:.4g} before, "
@@ -93,11 +98,11 @@ def in_words(about: dict) -> str:
 
 
 class _Pair:
-    """Two surfaces, and points on them."""
+    """The two surfaces to register, and points sampled on both."""
 
     def __init__(self, prediction: Mesh, reference: Mesh | np.ndarray, seed: int):
         points, face = sample_surface(prediction, MANY, (seed, 2))
-        # In any order: the first of them are a sample as well.
+        # In random order, so that the first points of either side are a sample of the whole surface.
         order = np.random.default_rng([seed, 4]).permutation(MANY)
         self.points, self.normals = points[order], face_normals(prediction)[face[order]]
         self.tree, self.face_normals = SurfaceDistance(prediction), face_normals(prediction)
@@ -113,7 +118,7 @@ class _Pair:
         self.size = float(np.sqrt(((self.truth - self.middle) ** 2).sum(1).mean()))
 
     def turns(self) -> list[Motion]:
-        """24 motions that bring middle, size and principal axes together."""
+        """Return 24 transforms that map centroid, size and principal axes of the mesh to those of the reference."""
         middle = self.points.mean(0)
         size = float(np.sqrt(((self.points - middle) ** 2).sum(1).mean()))
         own, wanted = (
@@ -128,7 +133,7 @@ class _Pair:
         return found
 
     def settled(self, motion: Motion, count: int, steps: int, scaled: bool) -> tuple[Motion, float, int]:
-        """The best motion on the way from this one, its mean distance, and how many steps were made."""
+        """Iterate from `motion`; return the best transform met, its mean distance, and the number of steps."""
         best, least, done, length = motion, np.inf, 0, np.inf
         while done < steps and length >= SMALLEST_STEP:
             following, distance, length = self.step(motion, count, scaled)
@@ -138,7 +143,7 @@ class _Pair:
         return best, least, done
 
     def step(self, motion: Motion, count: int, scaled: bool) -> tuple[Motion, float, float]:
-        """The motion after this one, the mean distance at this one, and how large the step is."""
+        """Return the next transform, the mean distance at `motion`, and the size of the step."""
         points, truth = motion.apply(self.points[:count]), self.truth[:count]
         there = self.nearest(points)
         back, face = self.tree.closest(motion.undo(truth))

@@ -1,4 +1,4 @@
-"""What cameras see of the surfaces that are scored, by Embree rays, and how far apart surfaces are along them."""
+"""Visibility of surface points in cameras, and distances between surfaces along pixel rays, by Embree."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ def count_views(
     enough: int = 1,
     faces: np.ndarray | None = None,
 ) -> np.ndarray:
-    """How many cameras see each point: inside the image, in front of it, and nothing before it on the ray.
+    """Count the cameras that see each point: it projects into the image, lies in front of the camera, and no face hides
+    it.
 
     Args:
         caster: of the mesh that can hide the points.
         points: (P, 3), in the frame of the cameras.
-        slack: length; what is no more than this before a point does not hide it.
-        enough: counting stops here.
-        faces: (P,) the face of the caster's mesh that each point lies on; it does not hide the point.
+        slack: length; a face at most this far in front of a point does not hide it.
+        enough: count at which a point needs no further cameras.
+        faces: (P,) face of the caster's mesh that each point lies on; it does not hide the point.
 
     Returns:
         (P,) int64, at most `enough`.
@@ -56,27 +57,27 @@ def count_views(
 def compare_along_rays(
     prediction: Mesh, reference: Mesh, cameras: Sequence[Camera], *, rays: int, tau: float, seed: int = 0
 ) -> dict:
-    """How far apart two surfaces are along the pixel rays that the cameras look along.
+    """Compare two surfaces along pixel rays of the cameras.
 
-    Each ray goes through the centre of a pixel and ends at its first hit of each mesh, from either side. Where
-    both are hit, the difference of the two distances from the camera gives `distance_mean` (of its size),
-    `distance_signed_mean` (positive: the prediction is behind the reference) and the quantiles
-    `distance_q50`, `_q90`, `_q95`. `miss` is the share of the rays that meet the reference but not the
-    prediction, `phantom` the share of those that do not meet the reference but do meet the prediction, and
-    `within_tau` the share of those that meet the reference on which the prediction is within `tau` of it, a
-    miss being a failure.
+    Each ray goes through the centre of a pixel and ends at its first hit of each mesh, from either side. Over the
+    rays that hit both, the difference of the two distances from the camera gives `distance_mean` (of its absolute
+    value), `distance_signed_mean` (positive: the prediction is behind the reference) and the quantiles
+    `distance_q50`, `_q90`, `_q95` of its absolute value. `miss` is the share of the rays with a hit of the reference
+    that do not hit the prediction. `phantom` is the share of the rays without a hit of the reference that hit the
+    prediction. `within_tau` is the share of the rays with a hit of the reference on which the prediction is within
+    `tau` of it; a miss counts as a failure.
 
     Args:
         prediction, reference: clean meshes in the frame of the cameras.
-        rays: how many rays are cast, over all cameras together in proportion to their pixels, each in an
-            equal share of its image; every pixel once if there are no more pixels.
+        rays: total number of rays, distributed over the cameras in proportion to their pixels and stratified
+            over each image; every pixel once if there are no more pixels than that.
 
     Returns:
-        the figures above with `rays`, `both` (share that meets both), `standard_error` (of `distance_mean`, as
-        for independent rays), `recast_rays` (rays that slipped between triangles and were answered by rays
-        beside them); NaN over no rays.
+        the figures above with `rays`, `both` (share of rays that hit both), `standard_error` (of `distance_mean`,
+        as if rays were independent), `recast_rays` (rays that slipped between triangles and were replaced by
+        neighbouring rays). A figure over no rays is NaN.
 
-    Accuracy: as `RayCaster`: 1e-12 of the diagonal, and to 1e-6 of it within that of an edge.
+    Accuracy: that of `RayCaster`, 1e-12 of the diagonal, and 1e-6 of it within that distance of an edge.
     """
     casters = [RayCaster(mesh.vertices, mesh.faces) for mesh in (prediction, reference)]
     pixels = sum(camera.width * camera.height for camera in cameras)
@@ -112,10 +113,10 @@ def compare_along_rays(
 
 
 def training_cameras(scene: str) -> list[Camera]:
-    """The cameras of the training views of the capture in the folder `scene`.
+    """Return the cameras of the training views of the capture in the folder `scene`.
 
     Raises:
-        LinprimError: the folder is no capture, or no view of it is for training.
+        LinprimError: the folder holds no capture, or the capture has no training views.
     """
     from linprim_geo.capture.load import load_scene
 

@@ -1,4 +1,4 @@
-"""Depth and normal scores: what a run renders, against a reference mesh or the data set's depth images."""
+"""Scores of the depth and normals that a run renders, against a reference mesh or the data set's depth images."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ def score_depth(
     predicted_normal: np.ndarray | None = None,
     reference_normal: np.ndarray | None = None,
 ) -> dict:
-    """Scores one depth map against another, over the pixels where both have a surface.
+    """Score one depth map against another, over the pixels where both have a surface.
 
-    A depth that is zero, negative, NaN or infinite means "no surface here". With p and r the depths of the
-    pixels that have both: `abs_rel` mean |p - r| / r, `sq_rel` mean (p - r)^2 / r, `mae` mean |p - r|, `rmse`
-    and `rmse_log` (natural logs), `delta1..3` the share with max(p / r, r / p) < 1.25, 1.25^2, 1.25^3. No
-    scale or shift is fitted. `coverage` is the share of the reference's pixels that the prediction covers,
-    `phantom` the share of the pixels without a reference surface where it claims one. Angles between unit
-    normals, in degrees: `normal_mean_deg`, `normal_median_deg` and the share under 11.25, 22.5 and 30
-    degrees, over pixels that also have both normals; a normal that points the wrong way is 180 degrees off.
+    A depth that is zero, negative, NaN or infinite means "no surface here". With p and r the predicted and the
+    reference depth: `abs_rel` is the mean of |p - r| / r, `sq_rel` of (p - r)^2 / r, `mae` of |p - r|; `rmse` and
+    `rmse_log` (natural logarithms) are root mean squares; `delta1..3` are the shares of pixels with
+    max(p / r, r / p) < 1.25, 1.25^2, 1.25^3. No scale or shift is fitted. `coverage` is the share of the reference's
+    pixels that the prediction covers, `phantom` the share of the pixels without a reference surface where the
+    prediction has one. Angles between unit normals are in degrees: `normal_mean_deg`, `normal_median_deg` and the
+    shares below 11.25, 22.5 and 30 degrees, over pixels that also have both normals. A normal of opposite direction
+    has an angle of 180 degrees.
 
     Args:
         predicted, reference: (H, W) depth along the optical axis, same unit.
@@ -76,13 +77,13 @@ def score_depth(
 
 
 def aggregate(views: Sequence[dict]) -> dict:
-    """Turns the scores of single views into those of a run: each is the mean over the views that have it.
+    """Combine the scores of single views: each score is the mean over the views that have it.
 
-    `l1_mean`, `l1_std`, `l2_mean`, `l2_std` are the mean and standard deviation over images of the per-image
-    mean absolute and root-mean-square error (the LinPrim paper's table 9), the deviation that of the images
-    at hand (divided by their number). `abs_rel_standard_error` is that of `abs_rel` as for independent views,
-    NaN of one. `views` counts the views, `scored_views` those with a pixel to compare,
-    and `pixels` adds those pixels up. A score that no view has is NaN.
+    `l1_mean`, `l1_std`, `l2_mean`, `l2_std` are the mean and standard deviation over images of the mean absolute
+    and the root-mean-square error of each image (table 9 of the LinPrim paper). The deviations are those of the
+    population (divided by the number of images). `abs_rel_standard_error` is the standard error of `abs_rel` as if
+    views were independent, NaN for a single view. `views` counts the views, `scored_views` those with at least one
+    pixel to compare, and `pixels` is the sum of these pixels. A score that no view has is NaN.
     """
     results = {
         key: _mean([view[key] for view in views]) for key in (*_DEPTH_KEYS, "coverage", "phantom", *_NORMAL_KEYS)
@@ -108,28 +109,28 @@ def eval_depth_run(
     depth: str = "depth_overlap",
     output: str | os.PathLike | None = None,
 ) -> dict:
-    """Renders depth and normals of a run and scores them against a mesh or the data set's depth images.
+    """Render depth and normals of a run and score them against a mesh or the data set's depth images.
 
-    The mesh is sampled by one ray per pixel, through the very pixel centres of the cameras; mesh and depth
-    images are in the frame and unit of the data set, and nothing is aligned or scaled. Writes `results.json`
-    and `per_view.csv` to `output`, by default the run's `eval/depth`.
+    The mesh is sampled by one ray per pixel, through the pixel centres of the same cameras. Mesh and depth images
+    are in the frame and unit of the data set; nothing is aligned or scaled. Writes `results.json` and
+    `per_view.csv` to `output`, by default the run's `eval/depth`.
 
     Args:
         run: a run folder, or an open run.
         reference: path of a mesh, or a `Mesh`; None takes the depth images of the views.
         split: "test", "train" or "all".
-        depth: which depth is scored. "depth_overlap" (the headline): where the transmittance falls to one half,
-            overlaps counted exactly (`Run.surface_depths`), the depth that surfaces are made of but at a level of one
-            half. Or one that is rendered, "depth_median" (the same in the run's own order of blending),
-            "depth_expected" or "depth_first".
+        depth: the depth that is scored. "depth_overlap" (the headline): where the transmittance falls to one half,
+            with exact treatment of overlapping primitives (`Run.surface_depths`); surfaces are extracted from the same
+            kind of depth, but at their own level of transmittance. Or a rendered depth: "depth_median" (the same in the
+            run's own order of blending), "depth_expected" or "depth_first".
 
     Returns:
         the scores of `aggregate`, lengths in the data set's unit and each also as `*_percent_diagonal`;
-        `reference_diagonal` is that of the mesh's bounding box, or of all reference pixels as points.
+        `reference_diagonal` is the diagonal of the bounding box of the mesh, or of all reference pixels as points.
 
     Raises:
-        LinprimError: the split is empty, the mesh is unusable or in no camera's view, a view's depth image
-            has another size than its camera, or no view has one.
+        LinprimError: the split is empty, the mesh is unusable or outside of every camera's view, a depth image
+            differs in size from its camera, or no view has a depth image.
     """
     start = time.perf_counter()
     run = open_run(run)
@@ -185,7 +186,7 @@ def eval_depth_run(
 
 
 def _open_reference(reference):
-    """(mesh or None, its RayCaster or None, what to call it in messages and results)."""
+    """Return (mesh or None, its RayCaster or None, its name for messages and results)."""
     if reference is None:
         return None, None, "depth images of the data set"
     from linprim_geo.geometry.mesh import validate_mesh
@@ -199,7 +200,7 @@ def _open_reference(reference):
 
 
 def _reference_maps(view, caster) -> tuple[np.ndarray, np.ndarray | None]:
-    """Depth (H, W) and, from a mesh, normals (H, W, 3) in the world's axes."""
+    """Return the reference depth (H, W) and, if it is from a mesh, normals (H, W, 3) in world axes."""
     if caster is None:
         return np.asarray(view.load_depth(), np.float64), None
     depth, _, normal = caster.render_depth(view.camera)
@@ -207,7 +208,7 @@ def _reference_maps(view, caster) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def _score_normals(predicted: np.ndarray, reference: np.ndarray) -> dict:
-    """Angles between rows of two (R, 3) arrays; rows without a normal on either side are left out."""
+    """Score the angles between the rows of two (R, 3) arrays of normals; rows where either has none are left out."""
     lengths = np.linalg.norm(predicted, axis=1) * np.linalg.norm(reference, axis=1)
     keep = np.isfinite(lengths) & (lengths > 0)
     if not keep.any():

@@ -1,4 +1,4 @@
-"""Pictures of mesh errors: error-coloured PLY files, rates against the threshold and a histogram as PNG."""
+"""Figures of mesh errors: PLY files coloured by error, and PNG plots of rates over thresholds and of a histogram."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.imaging import plots
 from linprim_geo.imaging.colors import error_colors
 
-# Error-coloured meshes are refined until no edge is longer than this share of the diagonal, so that a wall
-# made of two triangles shows what lies between its corners.
+# Longest edge of error-coloured meshes, as a share of the diagonal. Longer ones are subdivided, as a wall of two
+# triangles would show the errors of its corners only.
 COLOR_EDGE_SHARE = 1 / 150
 
-HISTOGRAM_QUANTILE = 99.0  # of either direction: where the axis of the histogram ends
-RATE_DECADES = (-2, 1)  # thresholds of the rates, as powers of ten times tau
+HISTOGRAM_QUANTILE = 99.0  # percentile of the distances, the larger of both directions, at which the axis ends
+RATE_DECADES = (-2, 1)  # range of the thresholds, as powers of ten times tau
 
 
 def write_error_meshes(
     folder: Path, prediction: Mesh, reference: Mesh | np.ndarray, color_max: float, diagonal: float
 ) -> None:
-    """Writes `error_pred.ply` and `error_ref.ply`: the surfaces with their exact distance to each other.
+    """Write `error_pred.ply` and `error_ref.ply`: the two surfaces with the exact distance to each other.
 
-    `quality` of a vertex is its distance, its colour that distance by `error_colors` of its share of
-    `color_max`. Meshes are refined so that colours show what lies between far corners. The points of a scan
-    stay points, and the prediction's distance to them is that to the nearest one.
+    The `quality` of a vertex is its distance; its colour is `error_colors` of the distance divided by `color_max`.
+    Meshes are refined, so that colours show the error between distant corners. A reference of scanned points stays
+    a point cloud, and the prediction's distance to it is that to the nearest point.
     """
     edge = COLOR_EDGE_SHARE * diagonal
     is_scan = isinstance(reference, np.ndarray)
@@ -55,7 +55,7 @@ def _error_of(points: np.ndarray, other, color_max: float) -> tuple[np.ndarray, 
 
 
 def _write_points(path: Path, points: np.ndarray, quality: np.ndarray, colors: np.ndarray) -> None:
-    """A binary PLY of points, coordinates in double precision."""
+    """Write a binary PLY of points, with coordinates in double precision."""
     columns = xyz_columns(points.astype(np.float64)) | color_columns(colors) | {"quality": quality}
     with atomic_write(path) as temporary:
         write_ply(temporary, columns)
@@ -65,7 +65,7 @@ def _write_points(path: Path, points: np.ndarray, quality: np.ndarray, colors: n
 
 
 def plot_rates(path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str) -> None:
-    """Writes a PNG of precision, recall and F1 against the threshold, from tau / 100 to 10 tau.
+    """Write a PNG of precision, recall and F1 over the threshold, from tau / 100 to 10 tau.
 
     Raises:
         LinprimError: the file cannot be written.
@@ -82,14 +82,14 @@ def plot_rates(path: Path, forward: Comparison, backward: Comparison, tau: float
 
 
 def plot_histogram(path: Path, forward: Comparison, backward: Comparison, tau: float, title: str, unit: str) -> None:
-    """Writes a PNG with the histograms of the distances of both directions, up to their 99 % quantiles.
+    """Write a PNG with the histograms of the distances of both directions, up to their 99 % quantiles.
 
     Raises:
         LinprimError: the file cannot be written.
     """
     kept = [side.distance[side.keep] for side in (forward, backward)]
     end = max((float(np.percentile(d, HISTOGRAM_QUANTILE)) for d in kept if len(d)), default=0.0)
-    # Coincident surfaces have nothing but rounding to show: the axis then ends at the threshold.
+    # The distances of coincident surfaces are rounding errors only. The axis then ends at the threshold.
     end = end if end > 1e-9 * tau else tau
     names = ("prediction to reference", "reference to prediction")
     plots.histogram(path, dict(zip(names, kept, strict=True)), end, tau, title, unit)

@@ -1,8 +1,7 @@
-"""Image scores: PSNR, SSIM and, where its weights are at hand, LPIPS of renders against held-out photographs.
+"""Image scores: PSNR, SSIM and, where its weights are available, LPIPS of renders against held-out photographs.
 
-Renders are clamped to [0, 1] and rounded to 8 bits before they are compared, exactly as a saved PNG would be,
-and a photograph with alpha is first composited over the background that the run renders with, and rounded to
-8 bits too.
+Renders are clamped to [0, 1] and rounded to 8 bits before the comparison, as in a saved PNG. Photographs with an alpha
+channel are first composited over the background that the run renders with, and rounded to 8 bits too.
 """
 
 from __future__ import annotations
@@ -21,11 +20,10 @@ from linprim_geo.imaging.metrics import composite, psnr, ssim, to_8bit
 
 
 def score_images(pairs: Iterable[tuple[np.ndarray, np.ndarray]]) -> dict:
-    """Scores (render, photograph) pairs: `psnr` in dB and `ssim`, means over the views, and the number of
-    `views`.
+    """Score (render, photograph) pairs: means over the views of `psnr` in dB and of `ssim`, and the number of `views`.
 
     Raises:
-        ValueError: there is no pair, or `psnr` refuses one.
+        ValueError: there are no pairs, or `psnr` rejects one.
     """
     scores = [(psnr(a, b), ssim(a, b)) for a, b in pairs]
     if not scores:
@@ -42,7 +40,7 @@ def eval_images_run(
     mesh: str | os.PathLike | None = None,
     lpips_weights: str | os.PathLike | None = None,
 ) -> dict:
-    """Renders the held-out views of a run, or a `mesh` from there, and scores them against the photographs.
+    """Render the held-out views of a run, or a `mesh` from the same cameras, and score them against the photographs.
 
     Writes `results.json` and `per_view.csv` (name, psnr, ssim, LPIPS) to `output`, by default the run's
     `eval/images`, of a mesh `eval/mesh_images`.
@@ -50,20 +48,20 @@ def eval_images_run(
     Args:
         run: a run folder, or an open run.
         split: "test", "train" or "all".
-        mesh: a file in the data set's frame, with a texture or colours (`mesh_images.render_mesh`), in place of the
-            primitives; it is shown as it is, without light.
-        lpips_weights: file or folder, see `lpips.find_lpips`; None takes what is installed or was downloaded before,
-            "none" leaves LPIPS out.
+        mesh: a file in the data set's frame, with a texture or colours (`mesh_images.render_mesh`), shown in place of
+            the primitives, unlit.
+        lpips_weights: file or folder, see `lpips.find_lpips`; None takes installed or previously downloaded weights,
+            "none" skips LPIPS.
 
     Returns:
         `psnr` in dB and `ssim`, means over the views, with `psnr_standard_error` and `ssim_standard_error`
-        as for independent views (NaN of one); `views`, `split`, `protocol`, `background` and `seconds`.
-        Where weights are at hand likewise `lpips_alex`, `lpips_vgg` and `lpips_vgg_3dgs` (as the tables of 3DGS and
-        LinPrim have it), and `lpips_files`; where they are not, `lpips_missing` says so.
+        as if views were independent (NaN for one view); `views`, `split`, `protocol`, `background` and `seconds`.
+        If weights are available also `lpips_alex`, `lpips_vgg`, `lpips_vgg_3dgs` (as in the tables of 3DGS and
+        LinPrim) and `lpips_files`; otherwise `lpips_missing` says what is missing.
 
     Raises:
-        LinprimError: the split is empty, the mesh cannot be read or has no colours, a render is not finite or of
-            another size than its photograph, or the weights that are given cannot be used.
+        LinprimError: the split is empty, the mesh cannot be read or has no colours, a render is not finite or
+            differs in size from its photograph, or the given weights cannot be used.
     """
     start = time.perf_counter()
     run = open_run(run)
@@ -112,10 +110,10 @@ def eval_images_run(
 
 
 def _distances(views, weights: str | os.PathLike | None) -> tuple[list, str]:
-    """What computes LPIPS of these views, and why nothing does.
+    """Return the networks that compute LPIPS of these views, and a sentence on why there are none.
 
     Raises:
-        LinprimError: weights are given, and cannot be used or are for larger images.
+        LinprimError: `weights` is given, and cannot be used or needs larger images.
     """
     if weights is not None and os.fspath(weights) == "none":
         return [], ""
@@ -136,7 +134,7 @@ def _distances(views, weights: str | os.PathLike | None) -> tuple[list, str]:
 
 
 def _standard_error(values: list[float]) -> float:
-    """NaN unless there are two values and all are finite (equal images have an infinite PSNR)."""
+    """Return NaN unless there are two values and all are finite (the PSNR of equal images is infinite)."""
     if len(values) < 2 or not np.isfinite(values).all():
         return float("nan")
     return float(np.std(values, ddof=1) / np.sqrt(len(values)))

@@ -1,9 +1,8 @@
-"""LPIPS, the learned perceptual distance of two images, by weights that are at hand: nothing is downloaded.
+"""LPIPS, a learned perceptual distance of two images, from weights found on this machine; nothing is downloaded.
 
-Features of a classifier after five of its layers are divided by their length over the channels; their squared
-difference, weighted per channel by a linear head, is averaged over the image and added up over the layers. Source:
-Zhang et al., "The unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018, eq. 1; version 0.1 of
-its weights.
+Features after five layers of a classifier are normalized to length 1 over the channels. Their squared difference is
+weighted per channel by a linear head, averaged over the image and summed over the layers. Source: Zhang et al., "The
+unreasonable effectiveness of deep features as a perceptual metric", CVPR 2018, eq. 1; version 0.1 of its weights.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ import torch
 
 from linprim_geo.base.errors import LinprimError
 
-# Colours in [-1, 1] become what the classifiers were trained on: ImageNet's mean and deviation, in that range.
+# Mean and standard deviation of ImageNet, the classifiers' training set, for colours in [-1, 1].
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-# Added to a feature's length.
+# Added to the length of a feature before the division.
 EPSILON = 1e-10
 SUFFIXES = (".pth", ".pt")
-# Packages that carry the heads, and where.
+# Packages that contain the heads, and the folder in each.
 PACKAGES = {"lpips": "weights/v0.1", "torchmetrics": "functional/image/lpips_models"}
 _KEY = re.compile(r"(?:features|net\.slice\d+)\.(\d+)\.(weight|bias)")
 
 
 @dataclass(frozen=True)
 class Conv:
-    """A convolution with a ReLU after it: its `index` in torchvision's `features`, and the max-pooling, of stride 2,
-    before it."""
+    """A convolution followed by a ReLU: its `index` in torchvision's `features`; `pool` is the size of the max-pooling
+    of stride 2 before it, 0 for none; `tap` whether its output is compared."""
 
     index: int
     channels: int
@@ -47,22 +46,22 @@ class Conv:
 
 @dataclass(frozen=True)
 class Network:
-    """A classifier's convolutions; `smallest` is the least edge in pixels that leaves something of the image in the
-    last of them."""
+    """The convolutions of a classifier; `smallest` is the least image side, in pixels, for which the last layer is not
+    empty."""
 
     name: str
     title: str
     convs: tuple[Conv, ...]
     smallest: int
-    file: str  # of torchvision's weights in torch's cache
+    file: str  # name pattern of torchvision's weights in torch's cache
 
     @property
     def taps(self) -> list[int]:
-        """Channels of the layers that are compared."""
+        """The channels of the layers that are compared."""
         return [conv.channels for conv in self.convs if conv.tap]
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Of the weights, by torchvision's names without `features.`."""
+        """Return the shapes of the weights, by torchvision's names without `features.`."""
         found, before = {}, 3
         for conv in self.convs:
             found[f"{conv.index}.weight"] = (conv.channels, before, conv.kernel, conv.kernel)
@@ -107,7 +106,7 @@ NETWORKS = {
 
 
 class Lpips:
-    """LPIPS by one network. `files` are the files that its weights came from."""
+    """LPIPS with one network. `files` are the files of its weights."""
 
     def __init__(
         self,
@@ -116,7 +115,7 @@ class Lpips:
         heads: Sequence[torch.Tensor],
         files: Sequence[Path] = (),
     ):
-        """`backbone`: tensors by the names of `Network.shapes`; `heads`: (C,) per layer, all float32."""
+        """`backbone`: tensors by the names of `Network.shapes`; `heads`: (C,) for each layer; all float32."""
         self.network, self.backbone, self.heads, self.files = (
             network,
             backbone,
@@ -126,13 +125,14 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, a: np.ndarray, b: np.ndarray, *, as_3dgs: bool = False) -> float:
-        """The distance of two images (H, W, 3) of one shape, uint8 or float in [0, 1]; 0 for equal ones, symmetric.
+        """Return the distance of two images (H, W, 3) of one shape, uint8 or float in [0, 1]. It is symmetric, and 0
+        for equal images.
 
-        With `as_3dgs` colours go in as they are, in [0, 1], where the network was calibrated for [-1, 1]: so do the
-        tables of 3DGS and of LinPrim, and distances come out smaller.
+        With `as_3dgs` colours are passed in [0, 1] although the network was calibrated for [-1, 1], as in the tables of
+        3DGS and LinPrim; distances come out smaller.
 
         Raises:
-            LinprimError: the images are smaller than the network takes.
+            LinprimError: the images are smaller than the network allows.
         """
         if min(a.shape[:2]) < self.network.smallest:
             least = self.network.smallest
@@ -170,15 +170,15 @@ def _unit(features: torch.Tensor) -> torch.Tensor:
 
 
 def find_lpips(weights: str | os.PathLike | None = None) -> tuple[list[Lpips], str]:
-    """LPIPS by every network whose weights are at hand, and a sentence about what is missing if there is none.
+    """Return LPIPS for every network whose weights are found, and a sentence on what is missing if there are none.
 
-    A network wants two sets of weights: torchvision's of the classifier, and the heads. Both may be in `weights`, a
-    file or a folder of `.pth` and `.pt` files of any names (one file of the whole of the package `lpips` will do); what
-    is not is taken from torch's cache of downloads and out of the installed packages `lpips` and `torchmetrics`, which
-    are not imported.
+    A network needs two sets of weights: torchvision's of the classifier, and the heads. Both may be in `weights`, a
+    file or a folder of `.pth` and `.pt` files of any names; one file with the whole model of the package `lpips` is
+    enough. The rest is read from torch's download cache and from the installed packages `lpips` and `torchmetrics`,
+    which are not imported.
 
     Raises:
-        LinprimError: `weights` is given and is missing, damaged, of another network, or not enough for any.
+        LinprimError: `weights` is given and is missing, damaged, of another network, or not sufficient for any.
     """
     backbones: dict[str, tuple[Path, dict]] = {}
     heads: dict[str, tuple[Path, list]] = {}
@@ -249,10 +249,10 @@ def _installed(network: Network) -> list[Path]:
 
 
 def _take(file: Path, backbones: dict[str, tuple[Path, dict]], heads: dict[str, tuple[Path, list]]) -> None:
-    """Adds what a file holds of the networks; nothing where it holds something else.
+    """Add the weights in a file to `backbones` and `heads`; add nothing if it holds other tensors.
 
     Raises:
-        LinprimError: it is no file of weights, or a tensor is missing, of another shape, or not finite.
+        LinprimError: it is not a file of weights, or a tensor is missing, of another shape, or not finite.
     """
     state = _read(file)
     convs = {f"{m[1]}.{m[2]}": value for key, value in state.items() if (m := _KEY.fullmatch(key))}
@@ -281,12 +281,12 @@ def _take(file: Path, backbones: dict[str, tuple[Path, dict]], heads: dict[str, 
 
 
 def _read(file: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a file, without running what it says."""
+    """Return the tensors of a file, without executing code from it."""
     try:
-        # Weights of a classifier's last layers are the most of it, and are not wanted; only files that are archives can
-        # be mapped.
+        # Memory mapping avoids reading the classifier's last layers, the largest and unused part. Only files that are
+        # archives can be mapped.
         state = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
-    except Exception as error:  # torch raises nearly anything for what is not its file
+    except Exception as error:  # torch raises nearly any exception for a file that is not its own
         reason = " ".join(str(error).split()).split(". ")[0][:120] or type(error).__name__
         raise LinprimError(f"{file}: cannot be read ({reason}), wanted weights that PyTorch has saved") from None
     if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):

@@ -1,9 +1,9 @@
-"""Mesh scores: exact distances from samples of one surface to the triangles of another; what `eval-mesh` calls.
+"""Mesh scores from exact distances between samples of one surface and the triangles of another, for `eval-mesh`.
 
-The headline protocol. Both surfaces are sampled uniformly by area, and each sample's distance to the
-*surface* of the other mesh is exact, so two meshes of one shape are 0 apart however they are triangulated.
-(Between point samples, N of them on an area A, the mean distance would be about sqrt(A / N) / 2 even for one
-and the same surface.) The protocols of published tables are in `protocols`.
+The headline protocol: both surfaces are sampled uniformly by area, and the distance of each sample to the *surface* of
+the other mesh is exact. Two meshes of one shape thus have distance 0 however they are triangulated. (Between two sets
+of N point samples on an area A, the mean distance would be about sqrt(A / N) / 2 even for the same surface.) The
+protocols of published tables are in `protocols`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from linprim_geo.geometry.region import as_text, inside, read_box
 
 DEFAULT_SAMPLES = 200_000
 DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
-# How far in front of a sample, in diagonals of its mesh, a ray may meet another face and the sample still
-# counts as seen: sixteen times the single-precision error of Embree in a centred scene.
+# Distance in front of a sample, in diagonals of its mesh, within which another face does not occlude it: sixteen times
+# the single-precision error of Embree in a centred scene.
 OCCLUSION_TOLERANCE = 1e-5
-# Samples are on creases in this part of their number.
+# The samples on creases are this many times fewer than those of the surface.
 CREASE_PART = 10
 HAUSDORFF_WARNING = "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
 
@@ -48,22 +48,22 @@ def score_mesh(
     cameras: Sequence[Camera] | None = None,
     unit: str = "unit of the meshes",
 ) -> dict:
-    """Scores a mesh against a reference mesh in the same frame and unit, by the headline protocol.
+    """Score a mesh against a reference mesh in the same frame and unit, by the headline protocol.
 
     `accuracy` is the mean distance from the prediction's surface to the reference, `completeness` that from
     the reference's surface to the prediction, `chamfer` the mean of the two. `precision` and `recall` are the
     shares of the two surfaces' areas within `tau` (inclusive) of the other, `f1` their harmonic mean.
     `normal_consistency` is the mean |cos| between the normal at a sample and that of the closest face of the
-    other mesh, averaged over the two directions; `normal_consistency_signed` keeps the sign (-1: inside out)
-    and is None unless both meshes are consistently oriented. `accuracy_q50`, `_q90`, `_q95` and the same of
-    completeness are quantiles. `hausdorff` is the largest distance met. Nothing is aligned, scaled or
-    cropped. `shape` says how the prediction looks beside the reference (`ShapeComparison.scores`), `triangles` what its
-    faces are like (`triangle_scores`).
+    other mesh, averaged over the two directions. `normal_consistency_signed` keeps the sign (-1: inside out);
+    it is None unless both meshes are consistently oriented. `accuracy_q50`, `_q90`, `_q95` and the same of
+    completeness are quantiles. `hausdorff` is the largest sampled distance. Nothing is aligned, scaled or
+    cropped. `shape` compares normals, creases and flat parts with those of the reference
+    (`ShapeComparison.scores`), `triangles` describes the prediction's faces (`triangle_scores`).
 
-    With `cameras`, `visible` holds the same scores over the samples that a camera sees: inside its image, in
+    With `cameras`, `visible` holds the same scores over the samples that a camera sees: those inside its image, in
     front of it, and not hidden by the sample's own mesh. Only the samples are culled; distances are still
     taken to the whole other mesh. `kept_prediction` and `kept_reference` are the shares of the areas that
-    were kept. `rays` holds what `compare_along_rays` finds along the cameras' pixels, one ray per sample.
+    were kept. `rays` holds the result of `compare_along_rays` on the cameras, with one ray per sample.
 
     Args:
         prediction, reference: triangle meshes; open, non-manifold and self-intersecting ones are fine. Faces
@@ -72,11 +72,11 @@ def score_mesh(
         tau: length; None takes 1 % of the diagonal of the reference's bounding box.
         seed: not negative; equal seeds give equal results.
         cameras: in the frame of the meshes.
-        unit: what lengths are called in the result.
+        unit: name of the unit of lengths in the result.
 
     Returns:
         the scores; each length also as `*_percent_diagonal` of the reference's bounding box. `standard_error`
-        is that of `chamfer` from the sampling alone. A score over no samples (nothing visible) is NaN.
+        is the one of `chamfer` due to sampling alone. A score over no samples (nothing visible) is NaN.
 
     Raises:
         LinprimError: a mesh has no usable face, or an option is out of range.
@@ -95,8 +95,8 @@ def score_mesh(
 def _score_headline(
     prediction, reference, *, samples, tau, seed, cameras, unit, box=None
 ) -> tuple[dict, Comparison, Comparison]:
-    """`score_mesh` of clean meshes, without `dropped`, and the two directions; with `box` over the samples in it
-    alone."""
+    """Compute `score_mesh` of clean meshes, without `dropped`, and the two directions; with `box` only over the samples
+    inside it."""
     start = time.perf_counter()
     diagonal = reference.diagonal
     tau = DEFAULT_TAU_SHARE * diagonal if tau is None else float(tau)
@@ -136,7 +136,7 @@ def _score_headline(
         visible |= reduce_scores(*sides, tau, oriented=oriented)
         visible["shape"] = shape.scores((keep_prediction, keep_reference), on_creases, diagonal)
         results["visible"] = with_percent(visible, diagonal)
-        if box is None:  # a ray comes from outside of it
+        if box is None:  # rays start outside of a box
             rays = compare_along_rays(prediction, reference, cameras, rays=samples, tau=tau, seed=seed)
             results["rays"] = with_percent(rays, diagonal)
     results = with_percent(results, diagonal)
@@ -154,30 +154,30 @@ def eval_mesh_files(
     run=None,
     **changes: Any,
 ) -> dict:
-    """Scores one mesh file against another and writes the scores, two error-coloured surfaces and two plots.
+    """Score one mesh file against another and write the scores, two error-coloured surfaces and two plots.
 
     `results.json`, `error_pred.ply`, `error_ref.ply`, `precision_recall.png` and `error_histogram.png` go to
-    `output`; without it to the run's `eval/mesh` (the headline) or `eval/mesh/PROTOCOL`, and without a run
-    nothing is written. The surfaces are the cleaned inputs, refined so that colours show what lies between far
-    corners; the `quality` of a vertex is its exact distance to the other surface, its colour that distance
-    from dark violet (0) to yellow (`color_max`, the larger 95 % quantile of the two directions, or beyond). The
-    plots show the distances that the protocol scores.
+    `output`, by default to the run's `eval/mesh` (the headline) or `eval/mesh/PROTOCOL`. With neither, nothing is
+    written. The surfaces are the cleaned inputs, refined so that colours show the error between distant corners. The
+    `quality` of a vertex is its exact distance to the other surface. Its colour is that distance, from dark violet
+    (0) to yellow (`color_max`, the larger 95 % quantile of the two directions, or beyond). The plots show the
+    distances that the protocol scores.
 
     Args:
-        options: how it is scored. `mask`, `box` and `plane` are read by `protocols.files`; `cameras` takes the place of
-            the run's; `transform` takes the prediction into the reference's frame, and so does what `align` finds
-            (`align.align`); the run's cameras go with the latter, those of `cameras` stay.
-        run: a run folder, or an open run: its training cameras give the headline's `visible` and `rays` and
+        options: the settings of the scoring. `mask`, `box` and `plane` are read by `protocols.files`. `cameras`
+            replaces the run's cameras. `transform` maps the prediction to the reference's frame, and so does the
+            transform that `align` finds (`align.align`), which also moves the run's cameras but not those of `cameras`.
+        run: a run folder, or an open run. Its training cameras give the headline's `visible` and `rays` and
             the culling of scannetpp, its scene the unit.
         changes: fields of `options` by name, such as `samples=5000`.
 
     Returns:
-        what `score_mesh` or `protocols.score_by_protocol` returns, with `align` (what was done, see `align.align`),
+        the result of `score_mesh` or `protocols.score_by_protocol`, with `align` (see `align.align`),
         `dropped`, `prediction`, `reference` (paths) and `color_max`.
 
     Raises:
         LinprimError: a file cannot be read or written, an option does not belong to the protocol, or the
-            protocol refuses a mesh or an option.
+            protocol rejects a mesh or an option.
     """
     options = replace(options or ScoreOptions(), **changes)
     check_score_options(options)
@@ -228,7 +228,7 @@ def eval_mesh_files(
 
 
 def _settings(options: ScoreOptions):
-    """The `Settings` of a published protocol, with the small files read; None for the headline."""
+    """Return the `Settings` of a published protocol, with its small files read; None for the headline."""
     from linprim_geo.eval.protocols.files import read_crop, read_observed_volume, read_plane
     from linprim_geo.eval.protocols.score import METERS_PER_UNIT, Settings
 
@@ -266,7 +266,7 @@ def _write(folder: Path, prediction, reference, forward, backward, results: dict
 
 
 def _within(side: Comparison, box: np.ndarray, name: str) -> Comparison:
-    """The comparison with the samples in a box alone."""
+    """Return the comparison restricted to the samples in a box."""
     keep = inside(side.points, box)
     if not keep.any():
         raise LinprimError(f"--box {as_text(box)} holds nothing of the {name}, wanted a box around a part of both")
@@ -281,7 +281,7 @@ def _compare(mesh: Mesh, other: SurfaceDistance, samples: int, seed) -> Comparis
 
 
 class _Seen:
-    """What cameras see of a mesh."""
+    """Visibility of points of a mesh from some cameras."""
 
     def __init__(self, mesh: Mesh, cameras: Sequence[Camera]):
         from linprim_geo.geometry.raycast import RayCaster
@@ -290,14 +290,14 @@ class _Seen:
         self.caster = RayCaster(mesh.vertices, mesh.faces)
 
     def shows(self, points: np.ndarray, faces: np.ndarray | None = None) -> np.ndarray:
-        """(P,) bool: whether some camera sees each of (P, 3) points of the mesh, on its (P,) faces."""
+        """Return (P,) bool: whether any camera sees each of (P, 3) points of the mesh, on its (P,) faces."""
         from linprim_geo.eval.culling import count_views
 
         return count_views(self.caster, points, self.cameras, self.slack, faces=faces) > 0
 
 
 def _is_oriented(mesh: Mesh) -> bool:
-    """Whether no directed edge is used twice: neighbours agree which side is out, no edge has three faces."""
+    """Return whether no directed edge is used twice: neighbouring faces are oriented alike, no edge has three faces."""
     starts, ends = mesh.faces.reshape(-1), np.roll(mesh.faces, -1, axis=1).reshape(-1)
     directed = np.sort(starts * len(mesh.vertices) + ends)
     return not (directed[1:] == directed[:-1]).any()

@@ -1,4 +1,4 @@
-"""A mesh seen from a run's cameras, in its texture or in the colours of its vertices: what a viewer would show."""
+"""Images of a mesh from a run's cameras, with its texture or vertex colours, as a viewer would show them."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from linprim_geo.runs.run import Run
 from linprim_geo.synthetic.textured import FileAlbedo, TexturedMesh, load_textured
 
 SAMPLES = 3
-"""Rays along each side of a pixel: outlines are within 1/18 of a pixel."""
+"""Rays along each side of a pixel. Outlines are accurate to 1/18 of a pixel."""
 
 RAYS_AT_ONCE = 1 << 20
 
 
 def render_mesh(run: Run, views: Iterable[View], mesh: str | os.PathLike) -> Iterator[tuple[View, dict]]:
-    """Renders a mesh in the data set's frame as `Run.render_views` renders primitives: without light, over the run's
-    background or environment.
+    """Render a mesh in the data set's frame, as `Run.render_views` renders primitives: unlit, over the run's background
+    or environment.
 
     Yields: (view, images) with float32 `rgb` (3, H, W) in [0, 1] and `opacity` (H, W), the share of each pixel that the
     mesh covers.
@@ -40,7 +40,7 @@ def render_mesh(run: Run, views: Iterable[View], mesh: str | os.PathLike) -> Ite
 
 
 def _seen(surface: TexturedMesh, caster: RayCaster, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Colour (3, H, W) times coverage, and coverage (H, W), float32, the mean over the rays of each pixel."""
+    """Return colour (3, H, W) times coverage, and coverage (H, W), float32, as means over the rays of each pixel."""
     fine = camera.magnified(SAMPLES)
     color = np.zeros((camera.height, camera.width, 3), np.float32)
     covered = np.zeros((camera.height, camera.width), np.float32)
@@ -63,7 +63,7 @@ def _seen(surface: TexturedMesh, caster: RayCaster, camera: Camera) -> tuple[np.
 
 
 def _behind(run: Run, camera: Camera) -> np.ndarray:
-    """(3, H, W) or (3, 1, 1) float32 what the run shows where nothing is."""
+    """Return (3, H, W) or (3, 1, 1) float32 the run's environment or background colour."""
     import torch
 
     from linprim_geo.kernels import ops

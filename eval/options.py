@@ -10,7 +10,7 @@ from linprim_geo.base.options import check, flag_of, option
 
 PROTOCOLS = ("headline", "linprim", "dtu", "tnt", "scannetpp")
 
-# The options of eval-mesh that only some protocols take.
+# The protocols that take an option of eval-mesh, for options that not all of them take.
 TAKEN_BY = {
     "samples": ("headline", "linprim"),
     "cameras": ("headline", "scannetpp"),
@@ -26,7 +26,7 @@ TAKEN_BY = {
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """How a mesh is scored against a reference."""
+    """The settings of the scoring of a mesh against a reference."""
 
     protocol: str = option(
         "headline", "headline: exact point to surface; the others as in the tables of that name", choices=PROTOCOLS
@@ -69,7 +69,7 @@ class ScoreOptions:
 
 
 def check_score_options(options: ScoreOptions) -> None:
-    """Raises LinprimError as `check`, and for an option that the protocol does not take."""
+    """Raise LinprimError as `check` does, and for an option that the protocol does not take."""
     check(options)
     for name, protocols in TAKEN_BY.items():
         if getattr(options, name) is not None and options.protocol not in protocols:
@@ -80,7 +80,7 @@ def check_score_options(options: ScoreOptions) -> None:
 
 @dataclass(frozen=True)
 class TradeoffOptions:
-    """What a sweep measures, and at which size."""
+    """The parameters that a sweep varies, and the sizes of its measurements."""
 
     parameters: tuple[str, ...] = option((), "what to sweep; a wrong name lists all (default all)", metavar="NAME")
     run: str | os.PathLike | None = option(

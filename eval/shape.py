@@ -1,7 +1,7 @@
-"""How a surface looks, which distances do not tell: its normals, creases and flat parts, and its triangles.
+"""Shape scores that distances do not cover: normals, creases, flat parts, and the quality of triangles.
 
-Two surfaces that are a hair apart may shade quite differently. Here normals are compared by angle, near the creases of
-the reference and elsewhere; creases with creases; and what the prediction does on the planes of the reference.
+Two surfaces at a small distance may be shaded quite differently. Normals are compared by angle, near the creases of the
+reference and elsewhere; creases of both are compared; and the prediction's flatness on the reference's planes measured.
 """
 
 from __future__ import annotations
@@ -18,24 +18,27 @@ from linprim_geo.surface.finish.mesh_process import paired_edges
 from linprim_geo.surface.finish.self_intersections import crossings
 
 CREASE = 30.0
-"""Degrees between the normals of two faces from which on the edge between them is a crease."""
+"""Degrees: an edge is a crease if the normals of its two faces differ by at least this."""
 
 SAME_PLANE = 0.5
-"""Degrees by which faces that share edges may lean to be one plane, each against its neighbour and their mean."""
+"""Degrees: largest angle of a face of a plane to its neighbour across an edge, and to the mean normal of the plane."""
 
 SMALLEST_PLANE = 1e-3
-"""Share of the reference's area from which on such faces are a plane that is looked at."""
+"""Least area of a plane that is scored, as a share of the reference's area."""
 
 GOOD_ANGLES = (5.0, 11.25)
-"""Degrees below which the share of the normals is told; of Wang and others 2015."""
+"""Degrees: limits of the reported shares of normals below them; from Wang and others 2015."""
 
 SLIVER = 5.0
-"""Degrees: a face with a smaller angle is a sliver."""
+"""Degrees: a face with an angle below this is a sliver."""
 
 
 def angle_scores(sides: list[np.ndarray]) -> dict:
-    """Of the cosines between the normals of samples and those of the other mesh, by direction: mean and median angle in
-    degrees, whichever way the normals point, and the shares below GOOD_ANGLES, each the mean of the directions."""
+    """Score the cosines between the normals of samples and those of the other mesh, given for each direction.
+
+    Return mean and median of the unsigned angle in degrees, and the shares below GOOD_ANGLES, each averaged over the
+    directions.
+    """
     angles = [np.degrees(np.arccos(np.clip(np.abs(cosine), 0, 1))) for cosine in sides]
 
     def both(score: Callable[[np.ndarray], float]) -> float:
@@ -46,7 +49,7 @@ def angle_scores(sides: list[np.ndarray]) -> dict:
 
 
 def crease_lines(mesh: Mesh) -> Mesh:
-    """The edges between two faces whose normals are CREASE degrees apart or more, as faces (a, b, b) without area."""
+    """Return the edges whose two faces have normals at least CREASE degrees apart, as faces (a, b, b) without area."""
     mesh = merge_vertices(mesh)
     one, other = paired_edges(mesh.faces)
     normals = face_normals(mesh)
@@ -57,7 +60,8 @@ def crease_lines(mesh: Mesh) -> Mesh:
 
 
 def sample_lines(lines: Mesh, count: int, seed) -> np.ndarray:
-    """(count, 3) points on `crease_lines`, one in each of `count` equal shares of the length; (0, 3) of none."""
+    """Return (count, 3) points on `crease_lines`, one in each of `count` equal shares of the length; (0, 3) without
+    lines."""
     start, end = lines.vertices[lines.faces[:, 0]], lines.vertices[lines.faces[:, 1]]
     reach = np.cumsum(np.linalg.norm(end - start, axis=1))
     if len(reach) == 0:
@@ -70,14 +74,14 @@ def sample_lines(lines: Mesh, count: int, seed) -> np.ndarray:
 
 
 def distance_to_lines(lines: Mesh, points: np.ndarray) -> np.ndarray:
-    """(P,) distances of (P, 3) points to `crease_lines`, infinity where there are none."""
+    """Return (P,) distances of (P, 3) points to `crease_lines`, infinity if there are none."""
     if len(lines.faces) == 0:
         return np.full(len(points), np.inf)
     return SurfaceDistance(lines).query(points)[0]
 
 
 def flat_regions(mesh: Mesh) -> np.ndarray:
-    """(F,) number of the plane that a face lies on, -1 on none: see SAME_PLANE and SMALLEST_PLANE."""
+    """Return (F,) the number of the plane that each face lies on, -1 for none; see SAME_PLANE and SMALLEST_PLANE."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -101,12 +105,12 @@ def flat_regions(mesh: Mesh) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ShapeComparison:
-    """What `scores` needs of two surfaces.
+    """The input of `scores` for two surfaces.
 
-    `near` (P,) bool per direction: samples near a crease of the reference. `creases` per direction (Q, 3) points on the
-    creases of one mesh, and (Q,) their distances to those of the other. `rows` of the samples on planes of the
-    reference, off creases, that the prediction comes near to, the number of their `plane`, and the `height` of the
-    prediction above it.
+    `near`: for each direction (P,) bool, samples near a crease of the reference. `creases`: for each direction (Q, 3)
+    points on the creases of one mesh, and (Q,) their distances to those of the other. `rows`: indices of the
+    reference's samples that lie on planes, off creases, and within tau of the prediction; `plane`: the number of each
+    one's plane; `height`: that of the prediction above it.
     """
 
     forward: Comparison
@@ -128,9 +132,9 @@ class ShapeComparison:
         samples: int,
         seed: int,
     ) -> ShapeComparison:
-        """Of two clean meshes and samples of them; `samples` points are drawn on the creases of each.
+        """Compare two clean meshes, given samples of both; `samples` points are drawn on the creases of each.
 
-        Flatness leaves out what is near creases, whose closest point may be around the corner."""
+        Flatness leaves out samples near creases, whose closest point may be on the other side of the crease."""
         lines = crease_lines(prediction), crease_lines(reference)
         points = [sample_lines(own, samples, (seed, 2 + k)) for k, own in enumerate(lines)]
         creases = tuple((points[k], distance_to_lines(lines[1 - k], points[k])) for k in range(2))
@@ -143,16 +147,16 @@ class ShapeComparison:
         return ShapeComparison(forward, backward, tau, near, creases, rows, number[rows], height)
 
     def scores(self, kept: Sequence[np.ndarray], creases_kept: Sequence[np.ndarray], diagonal: float) -> dict:
-        """Over the samples that are kept of the prediction and the reference, and those on their creases; lengths in %
-        of the diagonal, too.
+        """Score the samples in `kept`, of the prediction and the reference, and in `creases_kept`, those on their
+        creases; lengths also in % of the diagonal.
 
         Returns:
-            `normals`: `angle_scores` of all samples, `normals_near_creases` and `normals_off_creases` of those nearer
-            to a crease of the reference than tau and of the others. `creases`: `accuracy` and `completeness`, the mean
-            distance from the prediction's creases to the reference's and back, `chamfer` their mean, `precision` and
-            `recall` the shares within tau; lengths. `flatness`: of the prediction where it is within tau of a plane of
-            the reference and not near a crease, `rms`, the root mean square of its heights less their mean on that
-            plane, a length, and `planes`, how many there are.
+            `normals`: `angle_scores` of all samples; `normals_near_creases` and `normals_off_creases`: those of samples
+            nearer to a crease of the reference than tau, and of the others. `creases`: `accuracy` and `completeness`,
+            the mean distance from the prediction's creases to the reference's and back, `chamfer`, their mean, all
+            lengths; `precision` and `recall`, the shares within tau. `flatness`, of the prediction where it is within
+            tau of a plane of the reference and not near a crease: `rms`, the root mean square of its heights above the
+            plane minus their mean on that plane, a length; and `planes`, the number of planes.
         """
         sides = list(zip((self.forward, self.backward), kept, self.near, strict=True))
         found: dict = {"normals": angle_scores([side.cosine[keep] for side, keep, _ in sides])}
@@ -173,12 +177,12 @@ class ShapeComparison:
 
 
 def triangle_scores(mesh: Mesh) -> dict:
-    """`sliver_share`, of faces with an angle below SLIVER degrees, and `self_intersecting`, how many faces an edge
-    pierces that does not end on them; of a clean mesh."""
+    """Return for a clean mesh `sliver_share`, the share of faces with an angle below SLIVER degrees, and
+    `self_intersecting`, the number of faces pierced by an edge that does not end on them."""
     corners = mesh.vertices[mesh.faces]
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(edges, axis=2)
-    # The angle at corner k lies between the edge that leaves it and the one that comes to it.
+    # The angle at corner k is between the edges that leave and enter it.
     cosine = -(edges * np.roll(edges, 1, axis=1)).sum(2) / np.maximum(length * np.roll(length, 1, axis=1), 1e-300)
     slivers = (cosine > math.cos(math.radians(SLIVER))).any(1)
     pierced = len(np.unique(crossings(merge_vertices(mesh))[0]))

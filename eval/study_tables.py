@@ -1,4 +1,4 @@
-"""Files of tables that studies write: at the head how, where and when they were made."""
+"""Writes the tables of studies, with a first line on the command, the machine and the date."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from linprim_geo.base.files import atomic_write
 
 
 def write_table(path: Path, text: str) -> str:
-    """Writes a text under a line with the command of this process, the processor, its cores and the date. Returns both
-    without the last line's end."""
+    """Write a text below a line with the command of this process, the processor, its number of cores and the date.
+    Return the whole, without the final newline."""
     command = shlex.join(["python", *sys.orig_argv[1:]])
     head = f"Made by `{command}` on {processor()}, {usable_cores()} cores, {date.today().isoformat()}."
     whole = f"{head}\n\n{text.rstrip()}"
@@ -24,7 +24,7 @@ def write_table(path: Path, text: str) -> str:
 
 
 def processor() -> str:
-    """The model of this machine's processor, as far as the system tells."""
+    """Return the model of this machine's processor, if the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

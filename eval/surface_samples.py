@@ -1,4 +1,4 @@
-"""Points on meshes, their distances to other surfaces or points, and the scores that follow from the distances."""
+"""Sampling of meshes, distances of the points to other surfaces or points, and scores computed from the distances."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ import numpy as np
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 
 QUANTILES = (50, 90, 95)
-# Points sorted along a Morton curve visit the tree in an order that finds its nodes in the
-# cache: queries are 4x faster.
+# Queries in the order of a Morton curve visit nearby nodes of the tree, which are then in the cache: queries are 4x
+# faster.
 MORTON_BITS = 16
 NAN = float("nan")
 
 
 def sample_surface(mesh: Mesh, count: int, seed, *, independent: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Draws points uniformly by area: (count, 3) float64 points and the (count,) int64 faces they lie on.
+    """Draw points uniformly by area: (count, 3) float64 points and the (count,) int64 faces they lie on.
 
-    Inverse of the cumulative area over the faces in Morton order of their centroids, one draw in each of
-    `count` equal shares of the area. Every point is uniform over its share, so means are unbiased, and
-    neighbours in the returned order are neighbours on the surface, which makes a mean's error smaller than
-    that of independent draws.
+    Points are drawn by inverse transform of the cumulative area over the faces, in Morton order of their centroids, one
+    in each of `count` equal shares of the area. Every point is uniform over its share, so means are unbiased.
+    Neighbours in the returned order are neighbours on the surface, which makes the error of a mean smaller than with
+    independent points.
 
     Args:
         mesh: clean, with at least one face of non-zero area.
-        seed: anything that `numpy.random.default_rng` takes.
-        independent: draw every point from the whole area, as published protocols do. Distances from point to
-            point depend on it: evenly spread points are nearer to each other than independent ones.
+        seed: any argument of `numpy.random.default_rng`.
+        independent: draw every point from the whole area, as published protocols do. Point-to-point distances
+            depend on it: stratified points are nearer to each other than independent ones.
     """
     origin, edge_b, edge_c = corner_and_edges(mesh)
     area = face_areas(mesh)
@@ -40,7 +40,7 @@ def sample_surface(mesh: Mesh, count: int, seed, *, independent: bool = False) -
     target = share * ends[-1]
     slot = np.minimum(np.searchsorted(ends, target, side="right"), len(order) - 1)
     face = order[slot]
-    # The rest of the target inside its face is uniform in [0, 1]; its root is the distance from corner a.
+    # The target's position within its face is uniform in [0, 1]; its root is the relative distance from corner a.
     radius = np.sqrt(np.clip((target - (ends[slot] - area[face])) / area[face], 0.0, 1.0))
     along = random.random(count)
     weights_b, weights_c = radius * (1.0 - along), radius * along
@@ -49,16 +49,16 @@ def sample_surface(mesh: Mesh, count: int, seed, *, independent: bool = False) -
 
 
 class SurfaceDistance:
-    """Exact distances from points to the triangles of one mesh, by a tree that is built once.
+    """Exact distances from points to the triangles of one mesh, with a tree that is built once.
 
-    Works in float64 around the centre of the mesh's bounding box, so a far origin costs no digits beyond
-    those that the coordinates have already lost. On a needle of length L and width w the closest point can
-    be off along it by 1e-15 L (L / w)^2; where ordinary triangles share its edges they take its place, and
-    the distance is right to within w.
+    Computed in float64 relative to the centre of the mesh's bounding box, so a distant origin costs no digits beyond
+    those already lost in the coordinates. On a needle of length L and width w, the closest point can be off along the
+    needle by 1e-15 L (L / w)^2. If ordinary triangles share its edges, they are found instead, and the distance is
+    accurate to w.
     """
 
     def __init__(self, mesh: Mesh):
-        """`mesh` must have been through `clean_mesh`: igl crashes on empty ones and on foreign indices."""
+        """`mesh` must be a result of `clean_mesh`: igl crashes on empty meshes and on indices out of range."""
         import igl
 
         self.origin = mesh.bounds.mean(axis=0)
@@ -69,12 +69,12 @@ class SurfaceDistance:
         self._tree.init(self._vertices, self._faces)
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the (P,) distances of (P, 3) finite points to the surface and the (P,) closest faces."""
+        """Return the (P,) distances of (P, 3) finite points to the surface and the (P,) closest faces."""
         square, face, _ = self._query(points)
         return np.sqrt(square), face
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the (P, 3) points of the surface that are closest to (P, 3) finite points, and the (P,) faces."""
+        """Return the (P, 3) points of the surface that are closest to (P, 3) finite points, and the (P,) faces."""
         _, face, place = self._query(points)
         return place + self.origin, face
 
@@ -88,7 +88,7 @@ class SurfaceDistance:
 
 
 class PointDistance:
-    """Distances from points to the nearest of a set of (Q, 3) finite points, at least one; float64."""
+    """Distances from points to the nearest of (Q, 3) finite points, Q at least 1; float64."""
 
     def __init__(self, points: np.ndarray):
         from scipy.spatial import cKDTree
@@ -97,7 +97,7 @@ class PointDistance:
         self._tree = cKDTree(points - self.origin)
 
     def query(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the (P,) distances of (P, 3) finite points and the (P,) indices of the nearest ones."""
+        """Return the (P,) distances of (P, 3) finite points and the (P,) indices of the nearest points."""
         points = np.asarray(points, np.float64) - self.origin
         order = morton_order(points)
         distance, index = np.empty(len(points)), np.empty(len(points), np.int64)
@@ -106,7 +106,7 @@ class PointDistance:
 
 
 def morton_order(points: np.ndarray) -> np.ndarray:
-    """The permutation that sorts (P, 3) finite points along a Morton curve through their bounding cube."""
+    """Return the permutation that sorts (P, 3) finite points along a Morton curve through their bounding cube."""
     if len(points) == 0:
         return np.zeros(0, np.int64)
     low = points.min(axis=0)
@@ -121,10 +121,10 @@ def morton_order(points: np.ndarray) -> np.ndarray:
 
 
 def refine(mesh: Mesh, longest_edge: float, max_faces: int = 600_000) -> Mesh:
-    """Splits faces into four at their edges' midpoints until no edge is longer than `longest_edge`.
+    """Split faces into four at the midpoints of their edges until no edge is longer than `longest_edge`.
 
-    Stops before a round that would give more than `max_faces`. The surface stays where it was; a split face
-    beside an unsplit one leaves a vertex on the latter's edge. Attributes of vertices are dropped.
+    Stops before a round that would result in more than `max_faces`. The surface does not change. A split face next to
+    an unsplit one leaves a vertex on the latter's edge. Vertex attributes are dropped.
     """
     vertices, faces = mesh.vertices, mesh.faces
     while True:
@@ -144,13 +144,13 @@ def refine(mesh: Mesh, longest_edge: float, max_faces: int = 600_000) -> Mesh:
 
 
 def corner_and_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First corner of every face and the edges from it to the second and the third, each (F, 3)."""
+    """Return the first corner of every face and the edges from it to the second and the third, each (F, 3)."""
     a = mesh.vertices[mesh.faces[:, 0]]
     return a, mesh.vertices[mesh.faces[:, 1]] - a, mesh.vertices[mesh.faces[:, 2]] - a
 
 
 def longest_edges(mesh: Mesh) -> np.ndarray:
-    """(F,) length of the longest edge of each face."""
+    """Return (F,) the length of the longest edge of each face."""
     longest = np.zeros(len(mesh.faces))
     for k in range(3):
         edge = mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, k - 1]]
@@ -160,11 +160,11 @@ def longest_edges(mesh: Mesh) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Points of one surface and what the other one is like at the place closest to each.
+    """Points of one surface, with their distances to the other surface.
 
-    `distance` (P,), `cosine` (P,) between the normals or None, `keep` (P,) bool: which points are scored.
-    `points` (P, 3) and `face` (P,) say where they lie; `stratified` that they come in the order of
-    `sample_surface`, one from each of P equal shares of the area.
+    `distance` (P,); `cosine` (P,) between the normal at a point and that at the closest place, or None; `keep` (P,)
+    bool: which points are scored. `points` (P, 3) and `face` (P,) are their positions. `stratified`: the points are in
+    the order of `sample_surface`, one from each of P equal shares of the area.
     """
 
     distance: np.ndarray
@@ -184,17 +184,17 @@ def reduce_scores(
     strict: bool = False,
     limit: float = math.inf,
 ) -> dict:
-    """The scores of the two directions, prediction to reference and back, over their kept points.
+    """Compute the scores of the two directions, prediction to reference and back, over their kept points.
 
     Args:
         tau: threshold of `precision` and `recall`, inclusive unless `strict`.
-        oriented: both surfaces know which side is out, so the signed normal consistency means something.
-        limit: distances from here on are left out of the means and their standard error, and of nothing else.
+        oriented: both surfaces are consistently oriented, so the signed normal consistency is meaningful.
+        limit: distances from this on are left out of the means and their standard error, but of no other score.
 
     Returns:
-        `accuracy`, `completeness`, `chamfer`, `standard_error` (of chamfer, from the choice of the points),
+        `accuracy`, `completeness`, `chamfer`, `standard_error` (of chamfer, due to sampling),
         `precision`, `recall`, `f1`, `f1_standard_error`, `normal_consistency`, `normal_consistency_signed`,
-        `hausdorff` and `accuracy_q50` and so on; NaN over no points, None where there are no normals.
+        `hausdorff`, `accuracy_q50` and the other quantiles; NaN over no points, None without normals.
     """
     results, rates, rate_errors, cosines, errors = {}, [], [], [], []
     for name, side in (("accuracy", forward), ("completeness", backward)):
@@ -229,7 +229,7 @@ def reduce_scores(
 
 
 def with_percent(results: dict, diagonal: float) -> dict:
-    """Adds `*_percent_diagonal` beside every length among `results`."""
+    """Add `*_percent_diagonal` for every length in `results`."""
     lengths = ["accuracy", "completeness", "chamfer", "hausdorff", "tau", "standard_error", "rms"]
     for name in ("accuracy", "completeness", "distance"):
         lengths += [f"{name}_q{q}" for q in QUANTILES]
@@ -239,17 +239,17 @@ def with_percent(results: dict, diagonal: float) -> dict:
 
 
 def mean(values: np.ndarray) -> float:
-    """The mean as a float, NaN of nothing."""
+    """Return the mean as a float, NaN of an empty array."""
     return float(values.mean()) if len(values) else NAN
 
 
 def _standard_error(values: np.ndarray, keep: np.ndarray, stratified: bool) -> float:
-    """Standard error of the mean of `values[keep]`.
+    """Return the standard error of the mean of `values[keep]`.
 
-    Of independent points, their standard deviation over the root of their number. With one draw per share of
-    the area, neighbouring shares are taken in pairs and the variance within them is estimated by half the
-    squared difference; that is too large by half the squared difference of the pair's means, so the result
-    errs on the safe side. Source: Cochran, Sampling Techniques, 3rd ed., section 5A.12 (collapsed strata).
+    For independent points it is their standard deviation over the root of their number. With one draw per share of the
+    area, neighbouring shares are paired, and the variance within them is estimated by half the squared difference. This
+    is too large by half the squared difference of the pair's means, so the result is an upper estimate. Source:
+    Cochran, Sampling Techniques, 3rd ed., section 5A.12 (collapsed strata).
     """
     kept = int(keep.sum())
     if kept < 2:

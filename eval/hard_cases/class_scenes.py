@@ -1,4 +1,4 @@
-"""What scenes of the hard classes are made of: poses, extents, points inside, and the scenes that aim a ray at them."""
+"""Building blocks for scenes of the hard classes: poses, extents, inner points, and scenes with a ray aimed at one."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ POLYHEDRA = tuple(kind.name for kind in kinds.KINDS.values() if kind.solid)
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float, *shape: int) -> np.ndarray:
-    """10 to a power between `low` and `high`."""
+    """Return random numbers whose logarithm to base 10 is uniform between `low` and `high`."""
     return 10 ** rng.uniform(low, high, shape)
 
 
 def _rounded(x) -> Tensor:
-    """The nearest float32 numbers, as float64."""
+    """Return the nearest float32 numbers, as float64."""
     return torch.as_tensor(np.asarray(x, dtype=np.float64)).float().double()
 
 
@@ -41,7 +41,8 @@ def random_poses(rng: np.random.Generator, count: int, shift: float = 1.0) -> np
 
 
 def points_inside(rng: np.random.Generator, primitive: str, extent: np.ndarray, reach: float = 0.8) -> np.ndarray:
-    """A point in each primitive, local axes, relative to its centre, (..., 3); `reach` 1 goes to its surface."""
+    """Return a random point in each primitive (..., 3), in local axes relative to its centre; with `reach` 1 points go
+    up to the surface."""
     if primitive == "tetrahedron":
         share = rng.dirichlet(np.ones(4), extent.shape[:-1])
         share = reach * share + (1 - reach) / extent / (1 / extent).sum(-1, keepdims=True)  # the centre's own weights
@@ -68,16 +69,17 @@ def build(
     target: np.ndarray | None = None,
     one_color: bool = False,
 ) -> Scenes:
-    """Scenes from camera-space centres, with a window about the ray to a point of the first primitive.
+    """Build scenes from centres in camera space, with an image window around the ray to a point of the first primitive.
 
     Args:
         center: (B, M, 3), camera space; extent: (B, M, 3 or 4).
-        rotation: (B, M, 4) primitive to world, random without.
-        pose: (B, 4, 4), random without.
-        density: (B, M); without, such that the aimed ray has the thickness `tau` (B, M) in each primitive, 0.01 to 3
-            without.
-        focal: (B,) px; without, such that the largest extent covers `footprint` (B,) px, 1 to 300 without.
-        target: (B, 3) point that is aimed at, camera space; random inside the first primitive without.
+        rotation: (B, M, 4) primitive to world; random if None.
+        pose: (B, 4, 4) world to camera; random if None.
+        density: (B, M); if None, chosen such that the optical thickness of each primitive along the aimed ray is `tau`
+            (B, M), which is 0.01 to 3 if None.
+        focal: (B,) px; if None, chosen such that the largest extent covers `footprint` (B,) px, which is 1 to 300 if
+            None.
+        target: (B, 3) point to aim at, camera space; a random point inside the first primitive if None.
     """
     count, many = center.shape[:2]
     pose = random_poses(rng, count) if pose is None else pose
@@ -105,7 +107,7 @@ def build(
         aimed=torch.zeros(count, dtype=torch.long),
     )
 
-    # From here on with the rounded numbers, so that the ray hits.
+    # From here on with the numbers rounded to float32, so that the aimed ray hits.
     at, axes = (x.numpy()[:, 0] for x in many_scenes.camera_space(scenes))
     if target is None:
         for _ in range(12):
@@ -143,8 +145,8 @@ def build(
 
 
 def placed_before(rng, extent: np.ndarray, low: float = 0.3, high: float = 1.5) -> np.ndarray:
-    """Centres in front of the camera, 10^low to 10^high times the largest extent away, (B, M, 3); others near the
-    first."""
+    """Return centres (B, M, 3) in front of the camera, at a depth of 10^low to 10^high times the largest extent of the
+    first primitive; the other primitives are near the first."""
     count, many = extent.shape[:2]
     size = extent[:, 0].max(-1)
     z = size * log_uniform(rng, low, high, count)

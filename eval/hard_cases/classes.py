@@ -1,9 +1,9 @@
-"""Hard cases of the rasterizer as seeded generators: many tiny scenes at once, one named class of difficulty each.
+"""Seeded generators of hard cases for the rasterizer: batches of tiny scenes, in named classes by what makes them hard.
 
-A scene is a camera with a window of a few pixels and one or a few primitives; one of its rays is aimed at a point
-inside the first primitive, and the densities are chosen so that this ray neither misses nor is opaque, unless that is
-the point of the class. Everything is rounded to float32 values, held in float64, so that every variant of the accuracy
-ladder and the reference (`linprim_geo.eval.hard_cases.many_scenes`) see the same numbers.
+A scene is a camera with an image of a few pixels and one or a few primitives. One of its rays is aimed at a point
+inside the first primitive. Densities are chosen such that this ray neither misses nor is opaque, unless the class is
+about that. All numbers are rounded to float32 and held in float64, so that every variant of the accuracy ladder and the
+reference (`linprim_geo.eval.hard_cases.many_scenes`) get the same input.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ from linprim_geo.kernels.reference.rasterize import rotation_matrix
 
 @dataclass(frozen=True)
 class HardClass:
-    """One class of hard cases: `make(rng, primitive, ray_model, count)` gives `count` scenes.
+    """One class of hard cases: `make(rng, primitive, ray_model, count)` returns `count` scenes.
 
-    `value`: whether images and gradients are compared, or only looked through for NaN, infinity and transmittance;
-    `ties`: whether rays meet edges and vertices, where every one-sided gradient is right.
+    `value`: whether images and gradients are compared with the reference; if not, they are only checked for NaN,
+    infinity and an opacity outside [0, 1]. `ties`: whether rays meet edges and vertices, where every one-sided gradient
+    is right.
     """
 
     name: str
@@ -54,7 +55,7 @@ CLASSES: dict[str, HardClass] = {}
 
 
 def hard_class(name: str, **options):
-    """Registers the generator below it as a class of that name; its docstring says what is hard."""
+    """Register the decorated generator as a class of that name; its docstring becomes the printed description."""
 
     def add(make):
         CLASSES[name] = HardClass(name, make, about=(make.__doc__ or "").strip(), **options)
@@ -80,7 +81,8 @@ def several(rng, primitive, ray_model, count):
 
 
 def _thin(rng, primitive, ray_model, count, axes: int, low: float, high: float):
-    """`axes` of the half-axes shorter than the others by 10^low to 10^high, at least 1e-6."""
+    """Build primitives of which `axes` half-axes are shorter than the others by factors of 10^low to 10^high, but at
+    least 1e-6."""
     extent = random_extents(rng, primitive, count, low=-0.3, high=0.3)
     long = log_uniform(rng, -1, 1 if high < 5 else 3, count)[:, None]
     thin = 10 ** -rng.uniform(low, high, (count, 1))
@@ -176,8 +178,8 @@ def overflowing_axes(rng, primitive, ray_model, count):
 
 
 def _about_face(rng, primitive, ray_model, count, outside: bool, gap: np.ndarray):
-    """The camera at height `gap` (in distances of the centre from the face) over a face's plane, beside the face or on
-    it."""
+    """Place the camera near the plane of a face, over a point of the face or, with `outside`, beside it. `gap` is its
+    signed height over the plane, in units of the distance of the centre from the face."""
     extent = random_extents(rng, primitive, count)
     exact = rng.random(count) < 0.3
     extent[exact] = 2.0 ** np.round(np.log2(extent[exact]))
@@ -195,7 +197,7 @@ def _about_face(rng, primitive, ray_model, count, outside: bool, gap: np.ndarray
     share[exact, 2] = 1 - share[exact, 0] - share[exact, 1]
     arms = many_scenes.CORNERS[:3].numpy() if primitive == "tetrahedron" else np.eye(3)
     eye = (share * extent[:, 0, :3]) @ arms * (1 + gap[:, None])
-    # Local axes turned so that the centre, or for a camera on the face anything, is in view.
+    # Local axes turned such that the camera looks at the centre.
     q = rng.normal(size=(count, 1, 4))
     q[exact] = (1.0, 0.0, 0.0, 0.0)
     axes = rotation_matrix(torch.from_numpy(q[:, 0])).numpy()
@@ -393,7 +395,7 @@ def quaternions(rng, primitive, ray_model, count):
 
 
 def one_scene(scenes: Scenes, index: int, dtype: torch.dtype = torch.float64) -> tuple[list[Tensor], Camera, dict]:
-    """The tensors, camera and options of scene `index`, as `linprim_geo.kernels.ops.rasterize` takes them."""
+    """Return the tensors, camera and options of scene `index`, as arguments of `linprim_geo.kernels.ops.rasterize`."""
     s = scenes
     parameters = [x[index].to(dtype) for x in (s.center, s.rotation, s.extent, s.density, s.sh)]
     (fx, fy), (cx, cy) = s.focal[index].tolist(), s.middle[index].tolist()
@@ -403,6 +405,6 @@ def one_scene(scenes: Scenes, index: int, dtype: torch.dtype = torch.float64) ->
 
 
 def generate(name: str, primitive: str, ray_model: str, count: int, seed: int = 0) -> Scenes:
-    """`count` scenes of the class `name`, the same for the same arguments."""
+    """Return `count` scenes of the class `name`; equal arguments give equal scenes."""
     key = [seed, zlib.crc32(name.encode()), KINDS.index(primitive), ("exact", "affine").index(ray_model)]
     return CLASSES[name].make(np.random.default_rng(key), primitive, ray_model, count)

@@ -1,4 +1,4 @@
-"""The variants of the compiled kernels, and what one gives for many tiny scenes: images, gradients, whether finite."""
+"""Images and gradients of batches of tiny scenes by each variant of the compiled kernels, checked to be finite."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from linprim_geo.eval.hard_cases.many_scenes import PARAMETERS, Scenes
 from linprim_geo.kernels import ops
 
 SCALARS = {"float32": torch.float32, "float64": torch.float64}
-GEOMETRY_EVERY = 4  # scenes of which the gradients of all geometric images are looked through for NaN, one in so many
+GEOMETRY_EVERY = 4  # the gradients of all geometric images are checked for NaN in one of this many scenes
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One choice of the kernels."""
+    """One variant of the kernels."""
 
     primitive: str
     ray_model: str
@@ -28,17 +28,17 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """ray model-order-scalar."""
+        """The name, as ray model-order-scalar."""
         return f"{self.ray_model}-{self.order}-{self.scalar}"
 
     @property
     def eps(self) -> float:
-        """Distance from 1 to the next number."""
+        """Machine epsilon: distance from 1 to the next number."""
         return torch.finfo(SCALARS[self.scalar]).eps
 
 
 def variants(scalars: Sequence[str] = tuple(SCALARS)) -> list[Variant]:
-    """What the core can do; a Gaussian's two ray models are one."""
+    """Return all variants that the core has kernels for; both ray models of a Gaussian are the same and count once."""
     return [
         Variant(*variant)
         for variant in itertools.product(ops.KINDS, ops.RAY_MODELS, ops.ORDERS, scalars)
@@ -53,11 +53,11 @@ def _finite(tensors: Sequence[Tensor]) -> bool:
 def run_core(
     scenes: Scenes, variant: Variant, weights: Tensor, gradients: int
 ) -> tuple[Tensor, Tensor, list[Tensor], Tensor]:
-    """Renders every scene by itself and differentiates the first `gradients`.
+    """Render every scene by itself and differentiate the first `gradients` scenes.
 
     Returns:
-        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (each `gradients` rows), all float64, and (B,) bool:
-        everything finite.
+        rgb (B, 3, R), opacity (B, R), gradients to PARAMETERS (`gradients` rows each), all float64, and (B,) bool:
+        whether all values of a scene are finite.
     """
     dtype = SCALARS[variant.scalar]
     tensors = [getattr(scenes, name).to(dtype) for name in PARAMETERS]

@@ -1,9 +1,9 @@
-"""A float64 reference for thousands of tiny scenes at once, with the rounding that a variant may add to each ray.
+"""A float64 reference rasterizer for batches of thousands of tiny scenes.
 
-The same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time: there, frames at the
-primitive and a walk over primitives; here, planes in camera space, tables over (scene, ray, primitive, face), and
-depths counted from the point of the ray that is nearest to the centre, so that a chord of a small primitive far away
-keeps its digits.
+It computes the same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time, in another
+way. That one uses frames at the primitive and a loop over primitives. This one uses face planes in camera space, tables
+over (scene, ray, primitive, face), and depths relative to the ray's point nearest to the centre, so that the chord of a
+small distant primitive keeps its digits.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ C0 = 0.5 / math.sqrt(math.pi)  # the spherical harmonic of degree 0
 CORNERS = torch.tensor([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], dtype=torch.float64) / math.sqrt(3)
 FACE_SIGNS = torch.tensor(list(itertools.product((1.0, -1.0), repeat=3)), dtype=torch.float64)
 
-FAR = 1e12  # z-depth where the core ends every exact ray
-EDGE_ON = 1e-6  # a face nearer to edge-on than this part of its terms is moved to it by the core
+FAR = 1e12  # z-depth at which the core ends every exact ray
+EDGE_ON = 1e-6  # least divisor of a face's plane in the core, as a share of its terms; it is 0 for a face seen edge-on
 LARGEST_DENSITY = 1e20
 TILE = 16  # px along a side
 GAUSSIAN_CAP, GAUSSIAN_FLOOR, GAUSSIAN_SINGULAR = 0.99, 1 / 255, 1e-12
@@ -32,7 +32,7 @@ PARAMETERS = ("center", "rotation", "extent", "density", "sh")
 
 @dataclass(frozen=True)
 class Scenes:
-    """B scenes of M primitives of one kind, each with a camera of its own; float64."""
+    """B scenes of M primitives of one kind, each scene with its own camera; float64."""
 
     primitive: str
     ray_model: str
@@ -48,13 +48,13 @@ class Scenes:
     width: int
     height: int
     aimed: Tensor  # (B,) index of the pixel whose ray is aimed at the first primitive
-    coincident: bool = False  # the primitives of each scene are copies of one but for their densities
+    coincident: bool = False  # whether the primitives of a scene are copies that differ in density only
 
     def __len__(self) -> int:
         return len(self.center)
 
     def rows(self, index) -> Scenes:
-        """The scenes of a slice."""
+        """Return the scenes of a slice."""
         return replace(self, **{k: v[index] for k, v in vars(self).items() if isinstance(v, Tensor)})
 
 
@@ -63,32 +63,32 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def camera_space(s: Scenes) -> tuple[Tensor, Tensor]:
-    """Centres (B, M, 3) and axes (B, M, 3, 3), columns, in camera space."""
+    """Return centres (B, M, 3) and axes (B, M, 3, 3), as columns, in camera space."""
     turn = s.pose[:, None, :3, :3]
     zero = (s.rotation == 0).all(-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=s.rotation.dtype).expand_as(s.rotation)
-    # A scale of its own first: the square of a length of 1e-18 is a normal number, that of 1e-180 is none.
+    # Quaternions are scaled first: the square of a length of 1e-18 is a normal number, that of 1e-180 is not.
     size = torch.where(zero, torch.ones_like(s.rotation), s.rotation).detach().abs().amax(-1, keepdim=True)
     q = torch.where(zero, identity, s.rotation / size)
     return (turn @ s.center[..., None])[..., 0] + s.pose[:, None, :3, 3], turn @ rotation_matrix(q)
 
 
 def rays_of(s: Scenes) -> Tensor:
-    """(B, R, 3) rays (X, Y, 1) through the pixel centres."""
+    """Return (B, R, 3) rays (X, Y, 1) through the pixel centres."""
     grid = pixel_rays(s.width, s.height, 1.0, 1.0, 0.0, 0.0, s.center)
     xy = (grid[None, :, :2] - s.middle[:, None]) / s.focal[:, None]
     return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
 
 
 def view_limits(s: Scenes) -> tuple[Tensor, Tensor]:
-    """(B, 1, 2) least and largest x/z, y/z at which an affine approximation is taken: the image and 0.15 of its size
-    around it, in 1e4."""
+    """Return (B, 1, 2) least and largest x/z, y/z at which the affine approximation is evaluated: the image with a
+    margin of 0.15 of its size, within +-1e4."""
     size = s.center.new_tensor([s.width, s.height])
     return tuple(((share * size - s.middle) / s.focal)[:, None].clamp(-1e4, 1e4) for share in (-0.15, 1.15))
 
 
 def vertices(s: Scenes) -> tuple[Tensor, Tensor]:
-    """Vertices relative to their centres (B, M, V, 3) and the centres (B, M, 3), camera space."""
+    """Return vertices relative to their centres (B, M, V, 3) and the centres (B, M, 3), camera space."""
     center, axes = camera_space(s)
     if s.primitive == "tetrahedron":
         return s.extent[..., None] * (CORNERS @ axes.mT), center
@@ -97,7 +97,7 @@ def vertices(s: Scenes) -> tuple[Tensor, Tensor]:
 
 
 def faces(s: Scenes, axes: Tensor) -> Tensor:
-    """(B, M, F, 3) normals n of the faces n . (x - c) = 1, camera space.
+    """Return (B, M, F, 3) normals n of the faces n . (x - c) = 1, camera space.
 
     A tetrahedron's face through the vertices u_j = d_j e_j (j = 1, 2, 3) has n = (sum over cyclic of e_2 x e_3 / d_1) /
     det(e).
@@ -115,7 +115,7 @@ def faces(s: Scenes, axes: Tensor) -> Tensor:
 
 
 def drawn(s: Scenes, center: Tensor) -> Tensor:
-    """(B, M) whether a primitive is drawn at all."""
+    """Return (B, M) bool: whether each primitive is drawn at all."""
     positive = (s.extent >= 0 if s.primitive == "gaussian" else s.extent > 0).all(-1)
     if s.ray_model == "exact" and s.primitive != "gaussian":
         return positive
@@ -123,11 +123,11 @@ def drawn(s: Scenes, center: Tensor) -> Tensor:
 
 
 def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Each ray as origin + s direction relative to each centre, (B, R, M, 3) both, and the t or distance at its origin,
-    (B, R, M).
+    """Return each ray as origin + s direction relative to each centre, both (B, R, M, 3), and the parameter t (exact
+    rays) or the distance (affine rays) at its origin, (B, R, M).
 
-    The origin is the point of an exact ray nearest to the centre; that of an affine one lies in the plane through the
-    centre square to the view, which is taken within `view_limits`.
+    The origin of an exact ray is its point nearest to the centre. The origin of an affine ray lies in the plane through
+    the centre perpendicular to the viewing direction, which is limited to `view_limits`.
     """
     c = center[:, None]
     if s.ray_model == "exact":
@@ -152,30 +152,30 @@ def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Ten
 
 @dataclass(frozen=True)
 class Chords:
-    """What each ray crosses of each primitive, (B, R, M)."""
+    """The chords of every ray in every primitive, (B, R, M) each."""
 
     hit: Tensor
     tau: Tensor
     t_in: Tensor  # z-depth; 0 without a hit
     t_out: Tensor
-    # Both answers are right: a Gaussian's alpha within rounding of a threshold, a ray in the plane of a face.
+    # Two answers are right: a Gaussian's alpha is within rounding of a threshold, or the ray lies in a face's plane.
     doubtful: Tensor
-    of_entry: Tensor  # tau as far as the entry has made it, from an arbitrary point: of_exit - of_entry = tau
+    of_entry: Tensor  # tau up to the entry, from an arbitrary origin, so that of_exit - of_entry = tau
     of_exit: Tensor
 
 
 def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> Chords:
-    """Clips every ray to every primitive.
+    """Clip every ray to every primitive.
 
-    entry, leave: of several faces met at the same depth (to 1e-9 of the primitive's size), the one that the gradient
-    goes through, counted from 0; where there are fewer, the last.
+    entry, leave: which of several faces met at the same depth (to 1e-9 of the primitive's size) gets the gradient,
+    counted from 0; the last if there are fewer.
     """
     center, axes = camera_space(s)
     rays = rays_of(s)
     there = drawn(s, center)[:, None]
     if s.primitive == "gaussian":
         return _splats(s, center, axes, rays, there)
-    if s.ray_model == "affine":  # what is not drawn must not divide by its depth
+    if s.ray_model == "affine":  # avoids divisions by the depth of primitives that are not drawn
         center = torch.where(there[:, 0, :, None], center, torch.ones_like(center))
     extent = torch.where((s.extent > 0).all(-1, keepdim=True), s.extent, torch.ones_like(s.extent))
     normals = faces(replace(s, extent=extent), axes)[:, None]
@@ -186,7 +186,7 @@ def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> 
     t = left / torch.where(flat, torch.ones_like(slope), slope)
     infinite = torch.full_like(t, math.inf)
     tolerance = 1e-9 * s.extent.detach().abs().amax(-1)[:, None]
-    # A ray in the plane of a face is inside and outside.
+    # A ray in the plane of a face counts as inside and as outside.
     in_plane = ((slope.abs() * tolerance[..., None] < 1e-18) & (left.abs() < 1e-9)).any(-1) & there
     entries = _ranked(torch.where(slope < 0, t, -infinite), entry, tolerance, largest=True)
     exits = _ranked(torch.where(slope > 0, t, infinite), leave, tolerance, largest=False)
@@ -210,7 +210,7 @@ def chords(s: Scenes, entry: int = 0, leave: int = 0, grazing: bool = False) -> 
 
 
 def _ranked(t: Tensor, rank: int, tolerance: Tensor, largest: bool) -> Tensor:
-    # One of several equal ones: `amax` would share the gradient among them.
+    # Selects one of several equal values: `amax` would share the gradient among them.
     values, index = t.detach().topk(rank + 1, dim=-1, largest=largest)
     tied = (values - values[..., :1]).abs() <= tolerance[..., None]
     place = tied.sum(-1, keepdim=True).clamp(min=1) - 1
@@ -247,8 +247,9 @@ def _splats(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor, there: Tensor
 
 
 def gaussian_ellipse(s: Scenes, center: Tensor, axes: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, ...]]:
-    """The rows of H (B, M, 3), px, with the covariance M = H H^T; and M's xx, xy, yy, its determinant by Cauchy and
-    Binet, and the projected centre x/z, y/z; (B, M). H is taken where the centre is, but within `view_limits`."""
+    """Return the rows of H (B, M, 3), px, where M = H H^T is the projected covariance; and M's entries xx, xy, yy, its
+    determinant by Cauchy and Binet, (B, M) each, and the projected centre x/z, y/z (B, M, 2). H is evaluated at the
+    centre, limited to `view_limits`."""
     z = center[..., 2:]
     place = center[..., :2] / z
     held = torch.minimum(torch.maximum(place, view_limits(s)[0]), view_limits(s)[1])
@@ -264,11 +265,11 @@ def gaussian_ellipse(s: Scenes, center: Tensor, axes: Tensor) -> tuple[tuple[Ten
 
 
 def render(s: Scenes, order: str, entry: int = 0, leave: int = 0, found: Chords | None = None) -> tuple[Tensor, Tensor]:
-    """rgb over black (B, 3, R) and opacity (B, R) of every scene; no ray is stopped."""
+    """Return rgb over black (B, 3, R) and opacity (B, R) of every scene; rays are never stopped early."""
     found = found or chords(s, entry, leave)
     color = torch.relu(C0 * s.sh[:, :, 0] + 0.5)[:, None]  # (B, 1, M, 3)
     if order == "overlap" and s.coincident:
-        # Copies of one colour: the sum of the thicknesses.
+        # Copies of one colour: their thicknesses add up.
         total = found.tau.sum(-1, keepdim=True)
         rgb = (
             (-torch.expm1(-total))
@@ -287,12 +288,12 @@ def render(s: Scenes, order: str, entry: int = 0, leave: int = 0, found: Chords 
 
 
 def _before(tau: Tensor) -> Tensor:
-    """Sums of what comes before each, without a subtraction."""
+    """Return exclusive cumulative sums, computed without subtraction."""
     return torch.cat([torch.zeros_like(tau[..., :1]), torch.cumsum(tau[..., :-1], -1)], -1)
 
 
 def _overlapping(found: Chords, color: Tensor) -> tuple[Tensor, Tensor]:
-    """Emission and absorption over the segments between all entries and exits."""
+    """Return rgb and opacity by emission and absorption over the segments between all entries and exits."""
     none = torch.where(found.hit, 0.0, math.inf)
     edges = torch.sort(torch.cat([(found.t_in + none), (found.t_out + none)], -1), -1).values
     edges = torch.where(edges.isinf(), torch.zeros_like(edges), edges)
@@ -315,6 +316,6 @@ def _overlapping(found: Chords, color: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def aimed_chord(s: Scenes) -> Tensor:
-    """(B, M) thickness per density of the aimed ray, 0 where it misses."""
+    """Return (B, M) chord length of the aimed ray (thickness at density 1), 0 where it misses."""
     found = chords(replace(s, density=torch.ones_like(s.density)))
     return found.tau[torch.arange(len(s)), s.aimed]

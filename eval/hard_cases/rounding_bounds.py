@@ -1,4 +1,4 @@
-"""How far the arithmetic of a variant may be off, for the scenes of `many_scenes`: images, depths and gradients."""
+"""Bounds of the rounding errors of a kernel variant on the scenes of `many_scenes`: images, depths and gradients."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from linprim_geo.eval.hard_cases.many_scenes import (
 def _distances(
     s: Scenes, center: Tensor, place: Tensor, rays: Tensor, moved: Tensor, eps: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """|dx| and |dy| (B, R, M) of pixels from projected centres, and by how much they may be off (B, R, 2, M)."""
+    """Return |dx| and |dy| (B, R, M) of pixels from projected centres, px, and bounds of their errors (B, R, 2, M)."""
     tiny = 2.0**-53
     d = (rays[:, :, None, :2] - place[:, None]) * s.focal[:, None, None]
     dx, dy = d[..., 0].abs(), d[..., 1].abs()
@@ -45,7 +45,7 @@ def _distances(
 
 
 def _exponent(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor) -> Tensor:
-    """(B, R, M) d^T M^-1 d / 2."""
+    """Return (B, R, M) d^T M^-1 d / 2, the negated exponent of a Gaussian at offset d with covariance M."""
     (half_x, half_y), (_, _, _, det, place) = gaussian_ellipse(s, center, axes)
     d = (rays[:, :, None, :2] - place[:, None]) * s.focal[:, None, None]
     across = half_y[:, None] * d[..., :1] - half_x[:, None] * d[..., 1:]
@@ -55,11 +55,12 @@ def _exponent(s: Scenes, center: Tensor, axes: Tensor, rays: Tensor) -> Tensor:
 def _covariance_rounding(
     s: Scenes, center: Tensor, axes: Tensor, moved: Tensor
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """By how much xx, xy, yy and the determinant of a projected covariance may be off, (B, M) each, in double.
+    """Return error bounds of the entries xx, xy, yy and of the determinant of a projected covariance, (B, M) each, in
+    double precision.
 
-    A row of H is (axis_x - u axis_z) extent focal / z, each factor good to some 2^-53 and u to 2^-53 moved / z: 8 *
-    2^-53 of the sizes of its terms. The others follow by the rule of products; the determinant from the cross product
-    of the rows.
+    A row of H is (axis_x - u axis_z) extent focal / z. Each factor is accurate to a few 2^-53, and u to 2^-53 moved /
+    z, which gives 8 * 2^-53 of the sizes of its terms. The other bounds follow by the product rule, that of the
+    determinant from the cross product of the rows.
     """
     tiny = 2.0**-53
     (half_x, half_y), (_, _, _, _, place) = gaussian_ellipse(s, center, axes)
@@ -88,8 +89,8 @@ def _covariance_rounding(
 def _exponent_rounding(
     s: Scenes, center: Tensor, axes: Tensor, rays: Tensor, moved: Tensor, eps: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of a Gaussian's exponent: the sum of the sizes of its terms, by how much it may be off beside their rounding
-    (B, R, M), and whether rounding decides if the ellipse is flat (B, M)."""
+    """Return for a Gaussian's exponent: the sum of the absolute values of its terms, and a bound of its error beyond
+    their rounding, (B, R, M) each; and whether rounding decides if the ellipse is flat, (B, M) bool."""
     _, (xx, xy, yy, det, place) = gaussian_ellipse(s, center, axes)
     dx, dy, shift = _distances(s, center, place, rays, moved, eps)
     entries, det_off = _covariance_rounding(s, center, axes, moved)
@@ -102,25 +103,25 @@ def _exponent_rounding(
     size = 0.5 * (yy * dx * dx + 2 * xy * dx * dy + xx * dy * dy)
     size_off = (yy * dx + xy * dy) * shift[:, :, 0] + (xx * dy + xy * dx) * shift[:, :, 1]
     size_off = size_off + 0.5 * (yy * shift[:, :, 0] ** 2 + 2 * xy * shift.prod(2) + xx * shift[:, :, 1] ** 2)
-    # The entries of a needle's covariance cancel in the exponent, their errors do not.
+    # The entries of a needle's covariance cancel in the exponent; their errors do not.
     size_off = size_off + 0.5 * (off_yy * dx * dx + 2 * off_xy * dx * dy + off_xx * dy * dy) + size * det_off
     return size, size_off, flat
 
 
 def gaussian_gradient_rounding(s: Scenes, found: Chords, off: Tensor, pull: Tensor, eps: float) -> list[Tensor]:
-    """(B,) for each of PARAMETERS but the colours: by how much the gradient of a scene of Gaussians may be off.
+    """Return a bound (B,) of the gradient's error, for each of PARAMETERS but the colours, of scenes of Gaussians.
 
-    off: of `rounding`; pull (B, R, M): the size of the gradient to a ray's light times the colour. The kernel sums
-    g d d^T and g d over the pixels, g the gradient to the exponent, and goes on to the covariance M by Q S Q / 2 with
-    Q = M^-1, in absolute values
+    off: error bound of alpha, from `rounding`; pull (B, R, M): absolute gradient to a ray's light, times the colour.
+    The kernel sums g d d^T and g d over the pixels, where g is the gradient to the exponent, and gets the gradient to
+    the covariance M as Q S Q / 2 with Q = M^-1 and S the first sum. In absolute values
 
         |g|  <=  pull alpha / (1 - alpha), as the gradient to alpha is that to tau over 1 - alpha
         dg   <=  |g| (off / alpha + sum of the others' off / (1 - alpha) + (16 + 4 primitives) eps)
         dS   <=  sum (dg d d^T + |g| (d shift^T + shift d^T + shift shift^T)), shift as in `rounding`
-        dM   <=  |Q| dS |Q| / 2 + dQ S |Q|, where dQ is that of M's entries and determinant, in double
+        dM   <=  |Q| dS |Q| / 2 + dQ S |Q|, where dQ follows from M's entries and determinant, in double precision
 
-    and from M and the projected centre to the parameters by the sizes of their derivatives. For an ellipse k times
-    longer than wide |Q| |S| |Q| is k^2 times |Q S Q|: that is the gradient's condition.
+    From M and the projected centre, errors propagate to the parameters by the absolute values of their derivatives. For
+    an ellipse k times longer than wide |Q| |S| |Q| is k^2 times |Q S Q|: this is the condition of the gradient.
     """
     tiny = 2.0**-53
     leaves = {name: getattr(s, name).detach().clone().requires_grad_() for name in PARAMETERS[:3]}
@@ -154,7 +155,7 @@ def gaussian_gradient_rounding(s: Scenes, found: Chords, off: Tensor, pull: Tens
             )
 
         def product(a: tuple, m: tuple, b: tuple) -> tuple[Tensor, Tensor, Tensor]:
-            """The symmetric part of A M B for symmetric A, M, B, each (xx, xy, yy)."""
+            """Return the symmetric part of A M B for symmetric A, M, B, each (xx, xy, yy)."""
             first = a[0] * m[0] + a[1] * m[1], a[0] * m[1] + a[1] * m[2]
             second = a[1] * m[0] + a[2] * m[1], a[1] * m[1] + a[2] * m[2]
             return (
@@ -190,7 +191,7 @@ def gaussian_gradient_rounding(s: Scenes, found: Chords, off: Tensor, pull: Tens
 
 
 def _direction(s: Scenes, center: Tensor) -> Tensor:
-    """(B, M, 3) the unit direction that affine rays are taken to have: of the centre, within `view_limits`."""
+    """Return (B, M, 3) the unit direction assumed for affine rays: that of the centre, within `view_limits`."""
     at = center[..., :2] / center[..., 2:]
     held = torch.minimum(torch.maximum(at, view_limits(s)[0]), view_limits(s)[1])
     direction = torch.cat([held, torch.ones_like(held[..., :1])], -1)
@@ -198,8 +199,9 @@ def _direction(s: Scenes, center: Tensor) -> Tensor:
 
 
 def _divisors(s: Scenes, normals: Tensor, center: Tensor, safe: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(B, M, F) the h by which a face's plane over the pixels is divided, 0 for a face seen edge-on; the size of its
-    terms; and by how much it is off, in double. `safe`: the centres, in front of the camera."""
+    """Return (B, M, F) the divisor h of a face's plane over the pixels, 0 for a face seen edge-on; the sum of the
+    absolute values of its terms; and its error bound, in double precision. `safe`: the centres, with those not in front
+    of the camera replaced."""
     tiny = 2.0**-53
     moved = s.center.abs().sum(-1) + s.pose[:, None, :3, 3].abs().sum(-1)
     if s.ray_model == "exact":
@@ -213,12 +215,12 @@ def _divisors(s: Scenes, normals: Tensor, center: Tensor, safe: Tensor) -> tuple
 
 @torch.no_grad()
 def gradient_condition(s: Scenes, found: Chords, eps: float) -> Tensor:
-    """(B,) part of what entries and exits contribute to the gradient of a scene of polyhedra that is lost beside the
-    roundings of the sums.
+    """Return (B,) the relative error of what entries and exits contribute to the gradient of a scene of polyhedra,
+    beyond the rounding of sums.
 
-    A plane over the pixels and its derivatives are divided by h and h^2, which are off by `_divisors`. Moments of the
-    gradient are summed about a corner of a tile and moved to the primitive: a tile's 16 px times eps, as a part of the
-    primitive's width in pixels.
+    A plane over the pixels and its derivatives are divided by h and h^2, whose errors `_divisors` bounds. Moments of
+    the gradient are summed about a corner of a tile and then moved to the primitive, which costs 16 px, the width of a
+    tile, times eps, relative to the primitive's width in pixels.
     """
     center, axes = camera_space(s)
     there = drawn(s, center)
@@ -237,11 +239,11 @@ def gradient_condition(s: Scenes, found: Chords, eps: float) -> Tensor:
 def _gaussian_rounding(
     s: Scenes, there: Tensor, center: Tensor, axes: Tensor, moved: Tensor, alpha: Tensor, eps: float
 ) -> Tensor:
-    """`rounding` of Gaussians: `there` (B, M) the drawn ones, `moved` (B, M) by how many units of double precision the
-    camera's position may move a centre."""
+    """Compute `rounding` of Gaussians. `there` (B, M): which are drawn; `moved` (B, M): by how many units of double
+    precision the camera's position may shift a centre."""
     rays, center = rays_of(s), torch.where(there[..., None], center, torch.ones_like(center))
     size, size_off, flat = _exponent_rounding(s, center, axes, rays, moved, eps)
-    # Alpha is monotone in the exponent, but for two jumps: nothing below the floor, nothing of a flat ellipse.
+    # Alpha is monotone in the exponent except for two jumps: to 0 below the floor, and to 0 for a flat ellipse.
     off = torch.expm1((4 * eps + 64 * 2.0**-53) * size + size_off + 8 * eps).clamp(max=1e300)
     density = s.density.clamp(0, 1)[:, None]
     smooth = density * torch.exp(-_exponent(s, center, axes, rays))
@@ -253,8 +255,8 @@ def _gaussian_rounding(
 
 
 def _pixel_at(s: Scenes, at: Tensor, usable: Tensor) -> Tensor:
-    """(B, M, 3) direction, of depth 1, of the centre of the pixel that is nearest to `at`, where planes are evaluated
-    from; the middle of the image where a primitive has no place in it."""
+    """Return (B, M, 3) the direction, of depth 1, through the centre of the pixel nearest to `at`, the origin of the
+    planes' offsets; the pixel at the principal point for primitives that are not `usable`."""
     reference = torch.round(at * s.focal[:, None] + s.middle[:, None] - 0.5)
     middle = torch.floor(s.middle)[:, None].expand_as(reference)
     reference = torch.where(usable[..., None], reference, middle).clamp(-4e6, 4e6)
@@ -263,24 +265,23 @@ def _pixel_at(s: Scenes, at: Tensor, usable: Tensor) -> Tensor:
 
 
 def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tensor:
-    """(B, R, M) by how much the alpha of each ray and primitive may be off where planes are evaluated with unit
-    roundoff `eps` / 2.
+    """Return a bound (B, R, M) of the error of each alpha, for planes evaluated with unit roundoff `eps` / 2.
 
-    A face is w = a + b dx + c dy over the pixels, dx and dy from the pixel nearest to the projected centre, with w the
-    inverse depth less that of the centre (affine rays: the centre's distance less the distance). Rounded coefficients
-    and two operations leave w off by 2 eps (|a| + |b dx| + |c dy|), and the set-up in double by 16 * 2^-53 of its
-    terms; a face within EDGE_ON of edge-on is moved to it. Entry and exit, being a minimum and a maximum, are off by no
-    more, and alpha is monotone in both: its range over them is the bound. With `depths` the chord is the difference of
-    two depths, each good to 4 eps: what the order "overlap" does, whose segments end where several primitives' do. A
-    Gaussian's exponent is off by 4 eps of the sum of the sizes of its terms, by the position of its centre and, in
-    double, by its covariance; within that of the smallest alpha or of the flattest ellipse that is drawn, all of its
-    alpha is in doubt.
+    A face is w = a + b dx + c dy over the pixels, where dx and dy are offsets from the pixel nearest to the projected
+    centre, and w is the inverse depth minus that of the centre (affine rays: the centre's distance minus the distance).
+    Rounded coefficients and two operations give w an error of 2 eps (|a| + |b dx| + |c dy|), and the set-up in double
+    precision one of 16 * 2^-53 of its terms. A face within EDGE_ON of edge-on is moved to it. Entry and exit, being a
+    minimum and a maximum, have no larger errors, and alpha is monotone in both: the bound is its range over them. With
+    `depths` the chord is the difference of two depths, each accurate to 4 eps, as in the order "overlap", where the
+    segments end at entries and exits of several primitives. A Gaussian's exponent has an error of 4 eps of the sum of
+    its absolute terms, plus that of the position of its centre and, in double precision, of its covariance. Where this
+    reaches the smallest alpha or the flattest ellipse that is drawn, the error may be all of alpha.
     """
     center, axes = camera_space(s)
     there = drawn(s, center)
     rays = rays_of(s)
     tiny = 2.0**-53
-    # By how many `tiny` the subtraction of the camera's position may move a centre.
+    # By how many `tiny` the subtraction of the camera's position may shift a centre.
     moved = s.center.abs().sum(-1) + s.pose[:, None, :3, 3].abs().sum(-1)
     alpha = -torch.expm1(-found.tau)
     if s.primitive == "gaussian":
@@ -322,7 +323,7 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
     off = off + w.abs() * (h_off / kept.abs())[:, None]
     off, w = torch.nan_to_num(off, math.inf, math.inf), torch.nan_to_num(w, 0.0)
     inf = torch.full_like(w, math.inf)
-    # Where rounding decides whether a face is of the front or the back, it may end the chord anywhere, or nowhere.
+    # Where rounding decides whether a face is on the front or the back, it may end the chord anywhere, or nowhere.
     unsure = (h.abs() <= h_off)[:, None].expand_as(w)
     off = torch.where(unsure, inf, off)
     front, back = (h < 0)[:, None].expand_as(w) | unsure, (h > 0)[:, None].expand_as(w) | unsure
@@ -337,13 +338,13 @@ def rounding(s: Scenes, found: Chords, eps: float, depths: bool = False) -> Tens
         if exact:
             i, o = (w_in + w0[:, None]), (w_out + w0[:, None])
             t_in, t_out = 1 / i.clamp(min=1 / FAR), 1 / o.clamp(min=1 / FAR)
-            # (w_in - w_out) / (w_in w_out): the divisor has the inverse depth of the centre, rounded, in both factors.
+            # (w_in - w_out) / (w_in w_out): both factors of the divisor hold the rounded inverse depth of the centre.
             chord = across * (t_out - t_in) * (1 + sign * eps * w0[:, None] * (t_in + t_out))
         else:
             t_in, t_out = ((w0[:, None] - p).abs() / across for p in (w_in, w_out))
             chord = w_in - w_out
         if depths:
-            # Of a chord that the reference does not see, too.
+            # Also for chords that the reference does not have.
             reach = torch.where(found.hit, found.t_in.abs() + found.t_out.abs(), t_in + t_out)
             chord = chord + sign * 4 * eps * across * reach
         chord = torch.where(w_in > w_out, chord, torch.zeros_like(chord)).nan_to_num(0.0, 1e30)

@@ -1,25 +1,26 @@
 """How far the compiled rasterizer is from float64 truth on hard cases: `python -m linprim_geo.eval.hard_cases.stability
 [--json]`.
 
-Every class of `classes.py` is rendered and differentiated on every variant of the kernels (primitive, ray model,
-order, scalar) that the core has and compared with `linprim_geo.eval.hard_cases.many_scenes`. A forward case is one ray
-of one scene; a gradient case is one scene's gradient of a random weighting of its rgb and opacity. What must hold, else
-the exit status is 1:
+Every class of `classes.py` is rendered and differentiated by every variant of the kernels (primitive, ray model, order,
+scalar) that the core has, and compared with `linprim_geo.eval.hard_cases.many_scenes`. A forward case is one ray of one
+scene. A gradient case is one scene's gradient of a randomly weighted sum of its rgb and opacity. The exit status is 1
+unless all of this holds:
 
-    finite      no NaN or infinity in any image or gradient, of geometry too
+    finite      no NaN or infinity in any image or gradient, including those of the geometric images
     share       0 <= opacity <= 1
-    forward     every ray within the rounding that `rounding_bounds.rounding` derives for it, times BOUND
-    gradient    of resolved scenes within 1e-3 of the reference, and never off by more than its own magnitude; of
+    forward     every ray is within the bound that `rounding_bounds.rounding` derives for it, times BOUND
+    gradient    resolved scenes are within 1e-3 of the reference, and no error exceeds the gradient's own magnitude; for
                 polyhedra on 99.9 % of the cases, as a ray within rounding of an edge has the gradient of either face
 
-A scene is resolved where the same rounding leaves the sum of its rays' alphas known to 1e-4: a needle a millionth of a
-pixel wide has no gradient in single precision, nor has a face seen edge-on to 1e-6. The table says how many are.
+A scene is resolved if the same bound leaves the sum of its rays' alphas accurate to 1e-4. A needle a millionth of a
+pixel wide has no gradient in single precision, nor has a face within 1e-6 of edge-on. The table shows the resolved
+share.
 
-A gradient is the difference of what a ray's entry and its exit contribute, and is small behind opaque things: no scalar
-resolves one that cancels to less than some eps of these contributions without absorption. There, "relative" means to
-that many eps / 1e-3 of them: the roundings of the sums, and the condition of the gradient as rounding_bounds.py derives
-it, `gradient_condition` for polyhedra, `gaussian_gradient_rounding` for Gaussians. No limit comes from what a processor
-gave.
+A gradient is the difference of the contributions of a ray's entry and exit, and is small behind opaque things. No
+scalar resolves a gradient that cancels to less than a few eps of these contributions without absorption. Such errors
+are relative to that many eps / 1e-3 of the contributions: the roundings of the sums, and the condition of the gradient
+that rounding_bounds.py derives, `gradient_condition` for polyhedra and `gaussian_gradient_rounding` for Gaussians. No
+limit was taken from results of a processor.
 """
 
 from __future__ import annotations
@@ -44,19 +45,19 @@ from linprim_geo.eval.hard_cases.compiled import SCALARS, Variant, run_core, var
 from linprim_geo.eval.hard_cases.many_scenes import PARAMETERS, Scenes
 from linprim_geo.kernels import ops
 
-BOUND = 1.0  # times the rounding of `rounding_bounds.rounding`
+BOUND = 1.0  # allowed error, in units of the bound of `rounding_bounds.rounding`
 CLOSE, SHARE_CLOSE = 1e-3, 0.999
-# Roundings, in eps, of a gradient's sum over 16 pixels and of the colour and exponential in it; each primitive adds one
-# to the light that is left, the light behind it, their product and the exponential.
+# Roundings, in eps, of a gradient's sum over 16 pixels and of the colour and exponential in it; and those that each
+# primitive adds: of the remaining light, the light behind it, their product and the exponential.
 RESOLUTION, RESOLUTION_EACH = 16, 4
 FACES_TIED = 4  # faces that meet in a vertex of an octahedron
-TABLE = 2_000_000  # (scene, ray, primitive, face) that the reference holds at once
+TABLE = 2_000_000  # largest number of (scene, ray, primitive, face) entries that the reference holds at once
 
 
 @dataclass
 class Figures:
-    """What one class gave on one variant. `forward` is |rgb - reference| over the scene's largest reference value, or
-    of opacity."""
+    """Results of one class on one variant. `forward` is the largest of |rgb - reference| over the scene's largest
+    reference value, and of |opacity - reference|."""
 
     name: str
     primitive: str
@@ -68,13 +69,13 @@ class Figures:
     resolved: float = 1.0  # share of the gradient cases
     forward: float = 0.0
     over_bound: float = 0.0  # worst error in units of its own bound
-    gradient: float = 0.0  # worst of the resolved
+    gradient: float = 0.0  # worst error of the resolved cases
     close: float = 1.0  # share of the resolved gradients within CLOSE
     worst_scene: int = -1
     worst_gradient_scene: int = -1
 
     def problems(self) -> list[str]:
-        """What does not hold."""
+        """Return one text for each requirement that is not met."""
         # A ray within rounding of an edge between two faces has the gradient of the other; Gaussians have no edges.
         share, chance = (1.0, 0.0) if self.primitive == "gaussian" else (SHARE_CLOSE, 1.01)
         found = []
@@ -84,7 +85,7 @@ class Figures:
             found.append(f"{self.outside} scenes with an opacity outside [0, 1]")
         if not self.over_bound <= BOUND:
             found.append(f"forward {self.over_bound:.3g} times its bound (scene {self.worst_scene})")
-        # A single gradient more than the share allows is within the chance of a small sample.
+        # One gradient more than the share allows may be chance in a small sample.
         count = self.resolved * self.gradient_cases
         if (1 - self.close) * count > max(chance, (1 - share) * count):
             found.append(f"only {100 * self.close:.2f} % of the gradients within {CLOSE:g}")
@@ -95,14 +96,14 @@ class Figures:
 
 @dataclass(frozen=True)
 class Truth:
-    """The reference of some scenes in one order."""
+    """Images and gradients of the reference for some scenes in one order."""
 
     rgb: Tensor  # (B, 3, R)
     opacity: Tensor  # (B, R)
     gradients: list[list[Tensor]]  # one list for each choice among tied faces
     contributions: list[
         Tensor
-    ]  # (B,) each: size of what entries and exits contribute to each gradient, nothing absorbed
+    ]  # (B,) each: norm of the contributions of entries and exits to each gradient, without absorption
     doubtful: Tensor  # (B, R)
     found: many_scenes.Chords
 
@@ -118,14 +119,14 @@ def _gradients(loss: Tensor, leaves: dict[str, Tensor]) -> list[Tensor]:
     if loss.requires_grad:
         grads = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True, retain_graph=True)
     grads = [torch.zeros_like(x) if g is None else g for x, g in zip(leaves.values(), grads, strict=True)]
-    # Of a quaternion of length 1.
+    # Gradients to a quaternion of length 1.
     length = leaves["rotation"].detach().norm(dim=-1, keepdim=True)
     return [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(grads)]
 
 
 def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients: int) -> Truth:
-    """Images and, of the first `gradients` scenes, the gradients; with `ties` one for every choice of faces, and that
-    of a miss."""
+    """Return images and, for the first `gradients` scenes, gradients; with `ties` one gradient for every choice of
+    faces, and the zero gradient of a miss."""
     images, sets, sizes = [], [], []
     choices = list(itertools.product(range(FACES_TIED), repeat=2)) if ties else [(0, 0)]
     for part in _chunks(scenes):
@@ -147,8 +148,8 @@ def reference(scenes: Scenes, order: str, weights: Tensor, ties: bool, gradients
             for contribution in ((found.of_entry * pull).sum(), (found.of_exit * pull).sum()):
                 sides = torch.stack([_norm(g) for g in _gradients(contribution, leaves)])
                 size = torch.maximum(sides, size.expand_as(sides)) if ties else size + sides
-        # Colours get the weights themselves, and a density the length of its chord, which is no less certain than the
-        # primitive's size.
+        # The contributions to colours are the weights themselves; that to a density is the length of its chord, for
+        # which the primitive's largest extent is taken.
         if scenes.primitive != "gaussian":
             across = (found.hit * pull).sum(1) * some.extent.detach().abs().amax(-1)
             size[3] = torch.maximum(size[3], across.norm(dim=-1))
@@ -169,8 +170,8 @@ def _norm(x: Tensor) -> Tensor:
 
 
 def gradient_errors(scenes: Scenes, got: list[Tensor], wanted: list[Tensor], slack: list[Tensor]) -> Tensor:
-    """(B,) largest over PARAMETERS of |got - wanted| / max(|wanted|, slack / CLOSE), over whole scenes; `slack` (B,)
-    each: to what rounding leaves that gradient known."""
+    """Return (B,) the largest over PARAMETERS of |got - wanted| / max(|wanted|, slack / CLOSE), with norms over whole
+    scenes; `slack`: error bounds (B,) from rounding, for each parameter."""
     length = scenes.rotation[: len(got[0])].norm(dim=-1, keepdim=True)
     got = [g * torch.where(length > 0, length, torch.ones_like(length)) if i == 1 else g for i, g in enumerate(got)]
     errors = []
@@ -183,7 +184,7 @@ def gradient_errors(scenes: Scenes, got: list[Tensor], wanted: list[Tensor], sla
 def gradient_rounding(
     scenes: Scenes, found: many_scenes.Chords, off: Tensor, weights: Tensor, contributions: list[Tensor], eps: float
 ) -> list[Tensor]:
-    """(B,) for each of PARAMETERS: by how much the gradients may be off; `off` as `rounding` gives it."""
+    """Return error bounds (B,) of the gradients to each of PARAMETERS; `off` is the result of `rounding`."""
     part = (RESOLUTION + RESOLUTION_EACH * scenes.center.shape[1]) * eps
     if scenes.primitive != "gaussian":
         part = part + rounding_bounds.gradient_condition(scenes, found, eps)
@@ -197,7 +198,7 @@ def gradient_rounding(
 
 
 def judge(name: str, variant: Variant, scenes: Scenes, truth: Truth, weights: Tensor, gradients: int) -> Figures:
-    """Runs the core on the scenes and compares."""
+    """Run the core on the scenes and compare its images and gradients with `truth`."""
     what = hard_cases.CLASSES[name]
     rgb, opacity, grads, finite = run_core(scenes, variant, weights, gradients)
     figures = Figures(name, variant.primitive, variant.name, cases=opacity.numel(), gradient_cases=gradients)
@@ -214,10 +215,10 @@ def judge(name: str, variant: Variant, scenes: Scenes, truth: Truth, weights: Te
     )
     brightest = torch.relu(many_scenes.C0 * scenes.sh + 0.5).flatten(1).amax(1)[:, None]
     alpha = -torch.expm1(-truth.found.tau).sum(-1)
-    # Each of M factors exp(-tau) is good to 3e-7 = 2.5 eps in single precision.
+    # Each of M factors exp(-tau) is accurate to 3e-7 = 2.5 eps in single precision.
     allowed = off.sum(-1) + 4 * variant.eps * off.shape[2] * alpha
     if overlap and off.shape[2] > 1:
-        # An end that is off by d also lets each primitive absorb over d more of the others' light.
+        # With an end that is off by d, each primitive also absorbs the others' light over an extra length d.
         found = truth.found
         length = torch.where(found.hit, found.t_out - found.t_in, torch.ones_like(found.tau))
         ends = 4 * variant.eps * (found.t_in.abs() + found.t_out.abs()).sum(-1, keepdim=True)
@@ -227,7 +228,7 @@ def judge(name: str, variant: Variant, scenes: Scenes, truth: Truth, weights: Te
     color_bound = brightest * (2 * allowed + 16 * variant.eps * alpha) + 2 * variant.eps * terms * alpha + 1e-30
     opacity_bound = allowed + 4 * variant.eps * off.shape[2]
     ratio = torch.maximum(color_off / color_bound, opacity_off / opacity_bound).nan_to_num(math.inf).amax(1)
-    # Where a scene is nothing but rounding, relative to that.
+    # In scenes whose values are below the rounding error, relative to that error.
     largest = torch.maximum(truth.rgb.flatten(1).amax(1), color_bound.amax(1))
     figures.forward = float(torch.maximum(color_off.amax(1) / largest, opacity_off.amax(1)).nan_to_num(math.inf).max())
     figures.over_bound, figures.worst_scene = float(ratio.max()), int(ratio.argmax())
@@ -255,8 +256,8 @@ def _rows(found: many_scenes.Chords, part: slice) -> many_scenes.Chords:
 def measure(
     names: Sequence[str], chosen: Sequence[Variant], cases: int = 10_000, gradients: int = 200, seed: int = 0
 ) -> Iterator[Figures]:
-    """Figures of every class on every variant: at least `cases` rays and `gradients` scenes with a gradient on each;
-    `chosen` as `variants` orders them."""
+    """Yield the figures of every class on every variant, each from at least `cases` rays and `gradients` scenes with a
+    gradient; `chosen` has the order of `variants`."""
     for name in names:
         what = hard_cases.CLASSES[name]
         groups = itertools.groupby(chosen, key=lambda r: (r.primitive, r.ray_model))
@@ -282,7 +283,7 @@ def measure(
 
 
 def table(rows: Sequence[Figures]) -> str:
-    """The figures as text."""
+    """Return the figures as a text table."""
     lines = [
         f"{'class':26} {'primitive':12} {'variant':24} {'cases':>7} {'worst':>9} {'of bound':>9}"
         f" {'gradients':>9} {'resolved':>9} {'<= 1e-3':>9} {'worst':>9} {'NaN':>4}"
@@ -296,7 +297,7 @@ def table(rows: Sequence[Figures]) -> str:
 
 
 def report(rows: Sequence[Figures], seed: int) -> dict:
-    """The figures as the JSON document that `--json` prints."""
+    """Return the figures as the JSON document that `--json` prints."""
     classes = [
         {
             "name": r.name,
@@ -320,7 +321,7 @@ def report(rows: Sequence[Figures], seed: int) -> dict:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """The command; 0 if everything holds."""
+    """Run the command; return 0 if all requirements are met, else 1."""
     parser = argparse.ArgumentParser(
         prog="python -m linprim_geo.eval.hard_cases.stability", description=__doc__.split("\n")[0]
     )

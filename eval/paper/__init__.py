@@ -1,1 +1,1 @@
-"""The tables of the LinPrim paper, made again here."""
+"""Reproduction of the tables of the LinPrim paper."""

@@ -1,4 +1,4 @@
-"""LinPrim's table 3: PSNR of the held-out views by class of what is seen, given images of labels."""
+"""LinPrim's table 3: PSNR of the held-out views by semantic class, given label images."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from linprim_geo.imaging.metrics import composite, to_8bit
 from linprim_geo.runs.run import Run
 
 NAMES = "names.json"
-NOTHING = 255  # label of the stand-ins where no surface is
-# Parts of the built-in room; other parts, and those of other scenes, have numbers.
+NOTHING = 255  # label of pixels without a surface, in label images of built-in scenes
+# Names of the parts of the built-in room. Other parts, and those of other scenes, are named by their numbers.
 ROOM_PARTS = {0: "wall", 1: "floor", 2: "ceiling"}
 
 
 def classes(case: Case) -> list[dict]:
-    """Rows of table 3: per class PSNR of all its pixels in all held-out views together, of Gaussians and of octahedra.
+    """Return the rows of table 3: PSNR of Gaussians and of octahedra, per class over its pixels in all held-out views.
 
-    `case.labels` is a folder with a PNG of whole numbers for each held-out view, named as the view and as large as its
-    photograph, and `names.json` with {"number": "name"}, or without. The number 255 of 8-bit images is what has no
-    class.
+    `case.labels` is a folder with a PNG of integer labels for each held-out view, with the name and the size of its
+    photograph, and optionally `names.json` with {"number": "name"}. Pixels of the label 255 belong to no class.
 
     Raises:
-        LinprimError: an image of labels is missing, damaged, of another size, or of a distorted photograph.
+        LinprimError: a label image is missing, damaged, of another size, or of a distorted photograph.
     """
     errors = {kind: class_errors(case.trained(case.kinds[kind]), case.labels) for kind in ("gaussian", "octahedron")}
     names = _names(case.labels)
@@ -42,8 +41,8 @@ def classes(case: Case) -> list[dict]:
 
 
 def class_errors(folder: Path, labels: Path) -> dict[int, tuple[float, int]]:
-    """Of every label: the sum over its pixels of the squared error (mean over the channels, colours in [0, 1]), and
-    their number."""
+    """Return for each label the sum over its pixels of the squared error (mean over the channels, colours in [0, 1]),
+    and their number."""
     run = Run.open(folder)
     views = run.scene().test
     if not views:
@@ -63,8 +62,8 @@ def class_errors(folder: Path, labels: Path) -> dict[int, tuple[float, int]]:
 
 
 def read_labels(folder: Path, view: View) -> np.ndarray:
-    """(H, W) whole numbers at the pixels of the view's camera; of pixels that are averaged down, the one at the
-    middle."""
+    """Return (H, W) integer labels at the pixels of the view's camera. Of each block of pixels that is averaged to one,
+    the middle one gives the label."""
     from PIL import Image, UnidentifiedImageError
 
     file = next(
@@ -92,7 +91,7 @@ def read_labels(folder: Path, view: View) -> np.ndarray:
     first = (k - 1) // 2
     if label.ndim == 2:
         label = label[first::k, first::k]
-    # Averaging down crops what is left over of the last row and column.
+    # Downscaling crops an incomplete last row or column of blocks.
     fits = label.ndim == 2 and 0 <= label.shape[0] - camera.height <= 1 and 0 <= label.shape[1] - camera.width <= 1
     if not fits or label.dtype.kind not in "ui" or (k == 1 and label.shape != (camera.height, camera.width)):
         shape, size = "x".join(map(str, label.shape[1::-1])), f"{camera.width}x{camera.height}"
@@ -117,7 +116,8 @@ def _psnr(error: float) -> float:
 
 
 def stand_in_labels(folder: Path, shape: str, views: tuple[View, ...]) -> Path:
-    """Writes the part of a built-in scene that each pixel's middle sees, unless `folder` has it; returns `folder`."""
+    """Render the part of a built-in scene at each pixel's centre to label images, unless `folder` has them; return
+    `folder`."""
     from PIL import Image
 
     from linprim_geo.geometry.raycast import RayCaster

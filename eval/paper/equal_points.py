@@ -8,11 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-LEVELS = 3  # at which two curves are compared: both ends of what they share, and the middle
+LEVELS = 3  # number of levels at which two curves are compared: both ends and the middle of their common range
 
 
 def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
-    """The (x, psnr, ...) in the order of x, without those that no larger PSNR rewards for their larger x."""
+    """Return the points (x, psnr, ...) sorted by x, without those whose PSNR does not exceed that of all points before
+    them."""
     kept: list[tuple[float, ...]] = []
     for point in sorted(map(tuple, points)):
         if not kept or point[1] > kept[-1][1]:
@@ -21,10 +22,10 @@ def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
 
 
 def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...] | None:
-    """All but the PSNR of (count, psnr, cost, ...), all > 0, where the curve through `rising(points)` has PSNR `level`.
+    """Return all but the PSNR of (count, psnr, cost, ...), all > 0, at PSNR `level` on the curve `rising(points)`.
 
     Between neighbours the logarithms are linear in the PSNR: log x = (1 - f) log x0 + f log x1, f = (level - p0) / (p1
-    - p0). None outside of the curve; of a single point only its own PSNR is inside.
+    - p0). None outside of the range of the curve; that of a single point is its own PSNR.
     """
     curve = rising(points)
     for point in curve:
@@ -39,11 +40,11 @@ def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...
 
 
 def at_time(points: Sequence[Sequence[float]], seconds: float) -> float | None:
-    """PSNR after `seconds` on the curve through the (seconds, psnr), linear in the logarithm of time; None before its
-    first point.
+    """Return the PSNR after `seconds` on the curve through (seconds, psnr), linear in the logarithm of time; None
+    before the first point.
 
-    Points without a larger PSNR than an earlier one do not count, and after the last one the PSNR stays: the best so
-    far.
+    The curve is the best PSNR so far: points below an earlier PSNR are left out, and after the last point the PSNR
+    stays constant.
     """
     curve = [point for point in rising(points) if point[0] > 0]
     if not curve or seconds < curve[0][0]:
@@ -52,14 +53,14 @@ def at_time(points: Sequence[Sequence[float]], seconds: float) -> float | None:
 
 
 def shared_range(curves: Sequence[Sequence[float]]) -> tuple[float, float] | None:
-    """The (low, high) that lies within the range of every list of numbers; None if nothing does."""
+    """Return the intersection (low, high) of the ranges of all lists of numbers; None if it is empty."""
     low, high = max(min(c) for c in curves), min(max(c) for c in curves)
     return (low, high) if low <= high else None
 
 
 def equal_psnr(a: Sequence[Sequence[float]], b: Sequence[Sequence[float]]) -> list[dict]:
-    """Counts and frame times of two curves of (count, psnr, frame ms, core ms) at `LEVELS` PSNRs that both reach; [] if
-    there are none."""
+    """Compare counts and frame times of two curves of (count, psnr, frame ms, core ms) at `LEVELS` PSNRs that both
+    reach; [] if there are none."""
     both = shared_range([[p[1] for p in rising(curve)] for curve in (a, b)])
     if both is None:
         return []

@@ -1,4 +1,4 @@
-"""LinPrim's tables 1, 6 and 8, kinds of primitives against each other: counts and cost, work, stages, equal quality and
+"""LinPrim's tables 1, 6 and 8, which compare kinds of primitives: counts and cost, work, stages, equal quality and
 equal time."""
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ COMPARED = (("octahedron", "gaussian"), ("tetrahedron", "octahedron"), ("tetrahe
 
 
 def compare(rows: Sequence[dict]) -> dict:
-    """The comparisons of one scene: `equal_psnr`, `equal_time` (finished trainings), `equal_time_curves` (along one
-    training)."""
+    """Return the comparisons of one scene: `equal_psnr`, `equal_time` (of finished trainings) and `equal_time_curves`
+    (along one training)."""
     of = {name: [r for r in rows if r["model"] == name] for name in dict.fromkeys(r["model"] for r in rows)}
     result: dict = {"equal_psnr": [], "equal_time": [], "equal_time_curves": []}
     kinds = {name: members[0]["kind"] for name, members in of.items()}
@@ -43,7 +43,7 @@ def compare(rows: Sequence[dict]) -> dict:
 
 
 def _equal_psnr(pairs: Sequence[dict]) -> tuple[list[list[str]], list[str]]:
-    """The table's lines, and a note for each pair of models that have no PSNR in common."""
+    """Return the lines of the table, and a note for each pair of models whose ranges of PSNR do not overlap."""
     lines, notes = [], []
     for pair in pairs:
         name = " / ".join(pair["pair"])
@@ -57,7 +57,7 @@ def _equal_psnr(pairs: Sequence[dict]) -> tuple[list[list[str]], list[str]]:
 
 
 def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
-    """All tables of one scene as plain text."""
+    """Return all tables of one scene as plain text."""
     names, first = list(dict.fromkeys(r["model"] for r in rows)), rows[0]
     steps = first["options"]["iterations"]
     text = [f"== {scene}: {first['held_out_views']} held-out views of {first['pixels']:.0f} rays, {steps} steps =="]
@@ -135,7 +135,7 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
 
 
 def footnotes(rows: Sequence[dict]) -> str:
-    """What somebody who quotes the tables has to know."""
+    """Return the notes needed to quote the tables."""
     lines = [
         "Frames: of every view the median of interleaved repetitions, then the mean over views; CPU is the "
         "rendering thread's own time. "

@@ -1,4 +1,4 @@
-"""The tables of the paper: their columns and titles, and how rows become text."""
+"""The layout of the paper's tables: columns, titles, and the formatting of rows as text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from linprim_geo.eval.paper.surfaces import chamfers, depths
 from linprim_geo.eval.paper.text_tables import number, plain
 
 OF_KINDS = ("1", "6", "8")
-# Titles of columns, digits after the point, and whether a sign is shown.
+# Column titles, number of decimals, and whether a plus sign is shown.
 COLUMNS = {
     "psnr_3": ("degree 3, dB", 2, False),
     "change_2": ("degree 2", 2, True),
@@ -57,7 +57,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Table:
-    """How a table is called, what gives the rows of a scene, and what somebody who quotes it has to know."""
+    """The title of a table, the function that returns the rows of a scene, and the note needed to quote it."""
 
     title: str
     rows: Callable[[Case], list[dict]]
@@ -116,7 +116,8 @@ SAME = {"11": "7"}
 
 
 def table_text(table: Table, rows: list[dict]) -> str:
-    """A table as plain text: only the columns that a row has, ours and the published rows of each scene together."""
+    """Return a table as plain text, with only the columns that any row has. The measured and the published rows of a
+    scene are next to each other."""
     order = list(dict.fromkeys(row["scene"] for row in rows))
     rows = sorted(rows, key=lambda row: order.index(row["scene"]))
     names = [name for name in COLUMNS if any(name in row for row in rows)]

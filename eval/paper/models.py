@@ -1,5 +1,5 @@
-"""The models of the paper's tables: trained once by the function behind `linprim-geo train`, and what a frame of them
-costs."""
+"""The models of the paper's tables: trains each once, by the function behind `linprim-geo train`, and measures the cost
+of a frame."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ COUNTS = {
 
 @dataclass(frozen=True)
 class Variant:
-    """A kind of primitive and the rule by which its number grows."""
+    """A kind of primitive and the rule of densification."""
 
     kind: str
     population: str
 
     @staticmethod
     def parse(text: str) -> Variant:
-        """Of KIND or KIND:POPULATION; without one the population of `TrainOptions`."""
+        """Parse KIND or KIND:POPULATION; the default is the population of `TrainOptions`."""
         kind, _, population = text.partition(":")
         if kind not in KINDS:
             raise argparse.ArgumentTypeError(f"{kind!r} is none of {', '.join(KINDS)}")
@@ -58,7 +58,7 @@ class Variant:
 
     @property
     def name(self) -> str:
-        """KIND, or KIND:POPULATION where that is not the default."""
+        """KIND, or KIND:POPULATION if it is not the default."""
         return self.kind if self.population == TrainOptions.population else f"{self.kind}:{self.population}"
 
 
@@ -66,7 +66,7 @@ class Variant:
 
 
 class _Measured:
-    """Steps for `train` that count CPU seconds of this process, so that other work on the machine does not count.
+    """Counts the seconds of `train` as CPU seconds of this process, which other work on the machine does not affect.
 
     `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all
     steps.
@@ -91,16 +91,16 @@ class _Measured:
 
 @functools.cache
 def _warm_up(capture: Path, scene_options: SceneOptions) -> None:
-    """Two steps for nothing: the first ones of a process load code, which the first kind to be trained would pay
-    for."""
+    """Train two steps without using the result. The first steps of a process load code, and would otherwise count for
+    the first kind that is trained."""
     with tempfile.TemporaryDirectory() as folder:
         options = TrainOptions(iterations=2, max_primitives=50, threads=1)
         train(capture, Path(folder) / "run", scene_options, options, quiet=True)
 
 
 def thinness(extent: np.ndarray, kind: str) -> float:
-    """Median over primitives of shortest by longest: square roots of the eigenvalues of their vertices' (or the
-    Gaussian's) covariance."""
+    """Return the median over primitives of the shortest divided by the longest axis: square roots of the eigenvalues of
+    the covariance of their vertices, or of the Gaussian."""
     what = KINDS[kind]
     if not what.solid:
         return float(np.median(extent.min(1) / extent.max(1)))
@@ -118,10 +118,10 @@ def train_model(
     options: TrainOptions,
     folder: Path,
 ) -> dict:
-    """Trains and scores one model in `folder`, or takes what is there; what `model.json` in it holds.
+    """Train and score one model in `folder`, unless it is there already; return the content of its `model.json`.
 
     Raises:
-        LinprimError: `folder` holds a model of other options, or something else.
+        LinprimError: `folder` holds a model trained with other options, or other files.
     """
     from linprim_geo.eval.images import eval_images_run
 
@@ -135,7 +135,7 @@ def train_model(
     if folder.exists() and not is_unused(folder):
         if not (folder / "config.json").is_file():
             raise LinprimError(f"{folder}: exists and is not an earlier run; give another folder with -o")
-        shutil.rmtree(folder)  # stopped before it was done
+        shutil.rmtree(folder)  # an unfinished training
     _warm_up(capture, scene_options)
     measured = _Measured()
     trained = train(capture, folder, scene_options, options, quiet=True, advance=measured.advance)
@@ -165,7 +165,7 @@ def train_model(
 
 @dataclass(frozen=True)
 class Model:
-    """What renders: `primitives` and the frame of `cameras` are the training frame's, `how` the keywords of
+    """The input of a render: `primitives` and `cameras` in the training frame, and the keyword arguments `how` of
     `ops.rasterize`."""
 
     primitives: Primitives
@@ -175,7 +175,7 @@ class Model:
 
     @staticmethod
     def open(folder: Path) -> Model:
-        """A trained model with the held-out cameras of its scene."""
+        """Open a trained model with the held-out cameras of its scene."""
         from linprim_geo.eval import views_of
         from linprim_geo.runs.run import Run
 
@@ -191,14 +191,15 @@ class Model:
 
 
 def measure(models: Sequence[Model], repeats: int) -> list[dict]:
-    """Times and counts per frame of every model, on one thread: of every view the median over `repeats`, of these the
-    mean.
+    """Measure times and counts per frame of every model on one thread: for each view the median over `repeats`, then
+    the mean over views.
 
-    The models take turns, all views of one after those of another (after a frame that does not count, so that caches
-    are as warm as they are for somebody who looks around), so that a busy machine hurts all of them alike.
+    The models take turns, all views of one after those of another, so that other load on the machine affects all of
+    them alike. Each turn starts with a frame that is not measured, so that caches are as warm as in an interactive
+    viewer.
 
-    Returns: per model `frame_ms` (wall clock), `frame_cpu_ms` (the calling thread's, which renders alone), the `STAGES`
-        (wall clock of the core), the `COUNTS` and `pixels` of a frame.
+    Returns: per model `frame_ms` (wall clock), `frame_cpu_ms` (CPU time of the calling thread, the only one that
+        renders), the `STAGES` (wall clock within the core), the `COUNTS` and `pixels` of a frame.
     """
     threads, torch_threads = ops.threads(), torch.get_num_threads()
     samples: list[list[list[dict]]] = [[[] for _ in model.cameras] for model in models]

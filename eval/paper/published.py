@@ -1,7 +1,7 @@
-"""Figures of LinPrim's authors, to stand beside ours: other scenes than the built-in ones, other machines, 30,000 steps
-on a GPU.
+"""Results published by LinPrim's authors, for comparison with ours. They are of other scenes than the built-in ones, of
+other machines, and of 30,000 steps on a GPU.
 
-Source: von Luetzow and Niessner, arXiv 2501.16312, and their answers to its reviewers. What is not known is left out.
+Source: von Luetzow and Niessner, arXiv 2501.16312, and their answers to its reviewers. Unpublished values are left out.
 Scenes are those of ScanNet++ (39f36da05b, 5a269ba6fe, dc263dfbf0), Mip-NeRF 360 and NeRF-synthetic.
 """
 
@@ -11,7 +11,7 @@ SCANNETPP = ("39f36da05b", "5a269ba6fe", "dc263dfbf0")
 
 
 def _rows(table: str, names: tuple[str, ...], figures: dict) -> list[dict]:
-    """A row for every (scene, method) of `figures`, whose text has a value for each of the names, or a dash."""
+    """Return a row for every (scene, method) of `figures`; each text has a value, or a dash, for each of the names."""
     found = []
     for (scene, method), text in figures.items():
         values = [None if word == "-" else float(word) for word in text.split()]
@@ -21,7 +21,7 @@ def _rows(table: str, names: tuple[str, ...], figures: dict) -> list[dict]:
 
 
 def _over_scenes(scenes: tuple[str, ...], figures: dict[str, str]) -> dict:
-    """{(scene, method): text} of one text per method, whose parts for the scenes are divided by semicolons."""
+    """Return {(scene, method): text} from one text per method, with parts for the scenes separated by semicolons."""
     return {
         (scene, method): part
         for method, text in figures.items()
@@ -180,5 +180,5 @@ PUBLISHED = (
 
 
 def published(table: str) -> list[dict]:
-    """The authors' rows of one of their tables, by its number."""
+    """Return the authors' rows of the table of that number."""
     return [row for row in PUBLISHED if row["table"] == table]

@@ -1,8 +1,8 @@
-"""LinPrim's tables of single changes: degree of the colour, zooming out, fixed counts, tetrahedra; and exact rays
-against affine ones, an ablation that its authors promised.
+"""LinPrim's ablation tables: degree of the colour, zooming out, fixed counts, tetrahedra; and exact against affine
+rays, an ablation that its authors promised.
 
-Every function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the
-figures.
+Each function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the
+results.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from linprim_geo.eval.paper.models import Model, Variant, measure, train_model
 from linprim_geo.runs.run import Run
 
 SCALES = (1, 2, 4, 8)
-# Of the columns of quality, those of eval-images; LPIPS as published.
+# The keys of eval-images for the columns of quality; LPIPS as in the publication.
 QUALITY = {"ssim": "ssim", "psnr": "psnr", "lpips": "lpips_vgg_3dgs"}
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and how it is trained and scored; `options` has the largest of the populations `caps`."""
+    """A scene with the settings for training and scoring; `options` has the largest of the populations `caps`."""
 
     scene: str
     capture: Path
@@ -39,7 +39,7 @@ class Case:
     labels: Path | None = None
 
     def trained(self, variant: Variant, **options) -> Path:
-        """Folder of the run of a variant with other options, trained unless it is there."""
+        """Return the run folder of a variant with other options; train it unless it is there."""
         given = replace(self.options, primitive=variant.kind, population=variant.population)
         wanted = replace(given, **options)
         parts = [variant.name.replace(":", "_"), str(wanted.max_primitives)]
@@ -55,18 +55,18 @@ class Case:
         return folder
 
     def row(self, method: str, **figures) -> dict:
-        """A row of this scene."""
+        """Return a row of this scene."""
         return {"scene": self.scene, "method": method, "source": "here", **figures}
 
     def quality(self, method: str, folder: Path, **figures) -> dict:
-        """A row with the scores of the held-out views, and the number of primitives."""
+        """Return a row with the scores of the held-out views and the number of primitives."""
         scores = eval_images_run(folder, lpips_weights=self.lpips_weights)
         found = {name: scores[key] for name, key in QUALITY.items() if key in scores}
         return self.row(method, **found, count=Run.open(folder).state["primitives"], **figures)
 
 
 def degrees(case: Case) -> list[dict]:
-    """Table 2: PSNR of each degree of view-dependent colour less that of degree 3."""
+    """Return table 2: PSNR for each degree of view-dependent colour, relative to degree 3."""
     rows = []
     for kind in ("gaussian", "octahedron"):
         variant = case.kinds[kind]
@@ -85,8 +85,8 @@ def degrees(case: Case) -> list[dict]:
 
 
 def zooming_out(case: Case) -> list[dict]:
-    """Table 4: trained at full size with and without both filters, seen from 1, 2, 4 and 8 times as far: PSNR of
-    smaller images."""
+    """Return table 4: PSNR at image scales 1, 1/2, 1/4 and 1/8, as from 1, 2, 4 and 8 times the distance, of models
+    trained at full size with and without both filters."""
     rows = []
     for title, which in (("no filter", "none"), ("both filters", "3d+screen")):
         folder = case.trained(case.kinds["octahedron"], filter=which)
@@ -103,7 +103,7 @@ def zooming_out(case: Case) -> list[dict]:
 
 
 def fixed_counts(case: Case) -> list[dict]:
-    """Tables 7 and 11: MCMC with at most so many primitives, beside 3DGS's rules with the largest number allowed."""
+    """Return tables 7 and 11: MCMC with limited counts, and the densification of 3DGS with the largest limit."""
     rows = []
     for kind in ("gaussian", "octahedron"):
         runs = [(Variant(kind, "3dgs"), max(case.caps)), *((Variant(kind, "mcmc"), cap) for cap in case.caps)]
@@ -113,14 +113,14 @@ def fixed_counts(case: Case) -> list[dict]:
 
 
 def tetrahedra(case: Case) -> list[dict]:
-    """Table 12: octahedra against tetrahedra."""
+    """Return table 12: octahedra against tetrahedra."""
     return [
         case.quality(case.kinds[kind].name, case.trained(case.kinds[kind])) for kind in ("octahedron", "tetrahedron")
     ]
 
 
 def rays(case: Case) -> list[dict]:
-    """Exact rays against the papers' affine ones, in training and in rendering."""
+    """Compare exact rays with the papers' affine ones, in training and in rendering."""
     return _costed(
         case,
         {f"{model} rays": case.trained(case.kinds["octahedron"], ray_model=model) for model in ("exact", "affine")},
@@ -128,7 +128,8 @@ def rays(case: Case) -> list[dict]:
 
 
 def _costed(case: Case, folders: dict[str, Path]) -> list[dict]:
-    """Rows of quality with the CPU seconds of training and the CPU time of a frame, all models drawn in turn."""
+    """Return rows of quality with the CPU seconds of training and the CPU time of a frame, measured for all models in
+    turn."""
     frames = measure([Model.open(folder) for folder in folders.values()], case.repeats)
     rows = []
     for (method, folder), frame in zip(folders.items(), frames, strict=True):

@@ -1,4 +1,4 @@
-"""LinPrim's tables 9 and 10: depth against the true surface, and the surface fused from it."""
+"""LinPrim's tables 9 and 10: errors of the depth, and of the surface fused from it."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh
 
 VOXEL_M = 0.05
-# Where the unit is none of length: this share of the reference's diagonal, which is 5 cm of a room of 5 x 5 x 2.5 m.
+# Voxel size where lengths are not in metres: a share of the reference's diagonal, 5 cm in a room of 5 x 5 x 2.5 m.
 VOXEL_SHARE = 1 / 150
 METRES = ("m", "metre")
 KINDS = ("gaussian", "octahedron")
 
 
 def depths(case: Case) -> list[dict]:
-    """Table 9: of all photographs' median depth, mean and deviation over them of L1 and L2 (root mean square), and what
-    it covers in %.
+    """Return table 9: L1 and L2 (root mean square) errors of the median depth, as mean and deviation over all
+    photographs, and its coverage in %.
 
     Raises:
         LinprimError: the scene has neither a reference mesh nor depth images.
@@ -40,11 +40,11 @@ def depths(case: Case) -> list[dict]:
 
 
 def chamfers(case: Case) -> list[dict]:
-    """Table 10: TSDF of the median depth at 5 cm, and nothing done to it, by the protocol `linprim`; wants
-    `case.reference`.
+    """Return table 10: the Chamfer distance by the protocol `linprim` of a TSDF of the median depth with 5 cm voxels,
+    without post-processing; needs `case.reference`.
 
     Raises:
-        LinprimError: nothing comes out of a fusion.
+        LinprimError: a fusion has no surface.
     """
     rows = []
     for kind in KINDS:

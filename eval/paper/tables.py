@@ -47,7 +47,7 @@ from linprim_geo.synthetic.built_in import SHAPES
 
 VIEWS, TEST_VIEWS = 60, 12
 CAPS = (1250, 2500, 5000, 10_000, 20_000)
-CURVE_POINTS = 10  # scores on held-out views during a training
+CURVE_POINTS = 10  # number of evaluations on held-out views during a training
 QUICK = {
     "size": 48,
     "views": 12,
@@ -125,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
 
 @dataclass(frozen=True)
 class Capture:
-    """A scene's folder, how it is read, and its truth; `shape` of a built-in one."""
+    """A scene's folder, the options for reading it, and its ground truth; `shape` is set for built-in scenes."""
 
     folder: Path
     options: SceneOptions
@@ -135,7 +135,7 @@ class Capture:
 
 
 def _captures(args: argparse.Namespace) -> dict[str, Capture]:
-    """Every scene by its name; the built-in ones are made where they are missing."""
+    """Return every scene by its name; create the built-in ones that are missing."""
     from linprim_geo.synthetic.synth import synthesize
 
     for name in ("references", "labels"):
@@ -188,8 +188,8 @@ def _options(args: argparse.Namespace, cap: int) -> TrainOptions:
 
 
 def _models_of_kinds(args: argparse.Namespace, scene: str, capture: Capture) -> list[dict]:
-    """The models of tables 1, 6 and 8, by kind. They are trained by size, so that an early stop leaves complete
-    comparisons."""
+    """Return the models of tables 1, 6 and 8, sorted by kind. They are trained in the order of their sizes, so that an
+    early stop leaves complete comparisons."""
     rows = []
     for cap, variant in itertools.product(args.caps, args.kinds):
         folder = args.output / "models" / scene / f"{variant.name.replace(':', '_')}_{cap}"
@@ -206,7 +206,7 @@ def _models_of_kinds(args: argparse.Namespace, scene: str, capture: Capture) -> 
 
 
 def _of_kinds(args: argparse.Namespace, captures: dict[str, Capture]) -> None:
-    """Tables 1, 6 and 8."""
+    """Make tables 1, 6 and 8."""
     rows = {scene: _models_of_kinds(args, scene, capture) for scene, capture in captures.items()}
     for of_scene in rows.values():
         measured = measure([Model.open(Path(row["folder"])) for row in of_scene], args.repeats)
@@ -241,7 +241,7 @@ def _of_kinds(args: argparse.Namespace, captures: dict[str, Capture]) -> None:
 
 
 def _rows(name: str, args: argparse.Namespace, scene: str, capture: Capture) -> list[dict] | str:
-    """Those of one of `TABLES` on a scene, or the option that is missing for it."""
+    """Return the rows of one of `TABLES` for a scene, or the option that is missing for it."""
     kinds = {kind: next((v for v in args.kinds if v.kind == kind), Variant.parse(kind)) for kind in KINDS}
     loaded, labels = load_scene(capture.folder, downscale=capture.options.downscale), capture.labels
     if name == "3" and capture.shape:
@@ -271,7 +271,7 @@ def _rows(name: str, args: argparse.Namespace, scene: str, capture: Capture) -> 
 
 
 def _study(name: str, args: argparse.Namespace, captures: dict[str, Capture]) -> None:
-    """One of `TABLES` on all scenes that have what it needs."""
+    """Make one of `TABLES` for all scenes that have its input."""
     rows, left_out = [], []
     for scene, capture in captures.items():
         found = _rows(name, args, scene, capture)
@@ -294,7 +294,7 @@ def _finish(file: Path, text: str) -> None:
 
 
 def _parsed(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[str]]:
-    """What was asked for, and the tables."""
+    """Return the parsed arguments and the names of the tables."""
     parser = _parser()
     if parser.parse_args(arguments).quick:
         parser.set_defaults(**QUICK)
@@ -305,9 +305,9 @@ def _parsed(arguments: Sequence[str] | None) -> tuple[argparse.Namespace, list[s
 
 
 def scene_task(folder: Path, arguments: list[str], scene: str) -> dict:
-    """Trains the models of a scene that the tables of `arguments` want; who makes the tables finds them there."""
+    """Train all models of a scene for the tables of `arguments`, in a worker; the main process then finds them."""
     args, wanted = _parsed(arguments)
-    with redirect_stdout(sys.stderr):  # a worker answers on stdout
+    with redirect_stdout(sys.stderr):  # stdout of a worker is for its result
         capture = _captures(args)[scene]
         if set(wanted) & set(OF_KINDS):
             _models_of_kinds(args, scene, capture)
@@ -317,8 +317,8 @@ def scene_task(folder: Path, arguments: list[str], scene: str) -> dict:
 
 
 def _trained_by_workers(args: argparse.Namespace, arguments: list[str], captures: dict[str, Capture]) -> None:
-    """Has every scene's models trained by a worker of its own."""
-    # What is trained stays in `models`, so nothing is lost with the tasks' own folders.
+    """Train the models of each scene in its own worker."""
+    # Trained models are in `models`, so deleting the tasks' temporary folders loses nothing.
     with TemporaryDirectory(prefix="tasks_", dir=args.output) as folder:
         function = "linprim_geo.eval.paper.tables:scene_task"
         tasks = [

@@ -1,1 +1,1 @@
-"""How public benchmarks score meshes."""
+"""Mesh protocols of public benchmarks."""

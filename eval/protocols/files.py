@@ -1,4 +1,4 @@
-"""Reading what published mesh protocols come with: observation masks, planes, crop volumes, alignments, scans."""
+"""Readers of the files of published mesh protocols: observation masks, planes, crop volumes, transforms, scans."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from linprim_geo.geometry.mesh_files import load_mesh
 
 @dataclass(frozen=True)
 class ObservedVolume:
-    """Where the reference was observed: a box `low`..`high` (3,) and, if known, which cells of it.
+    """The observed part of the reference: a box `low`..`high` (3,) and, if known, which of its cells.
 
-    `cells` is a bool grid whose cell (i, j, k) has its middle at `low` + (i, j, k) `edge`, or None.
+    `cells` is a bool grid, or None; the centre of cell (i, j, k) is `low` + (i, j, k) `edge`.
     """
 
     low: np.ndarray
@@ -28,7 +28,7 @@ class ObservedVolume:
     edge: float = 0.0
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool: which of (P, 3) points lie in an observed cell; all do if the cells are not known."""
+        """Return (P,) bool: which of (P, 3) points lie in an observed cell; all if the cells are unknown."""
         if self.cells is None:
             return np.ones(len(points), bool)
         index = np.rint((points - self.low) / self.edge).astype(np.int64)
@@ -48,7 +48,7 @@ class CropVolume:
     polygon: np.ndarray
 
     def holds(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool: which of (P, 3) points lie inside, by the even-odd rule."""
+        """Return (P,) bool: which of (P, 3) points lie inside, by the even-odd rule."""
         along = points[:, self.axis]
         x, y = np.delete(points, self.axis, axis=1).T
         inside = np.zeros(len(points), bool)
@@ -60,10 +60,10 @@ class CropVolume:
 
 
 def read_reference(path: str | os.PathLike, points_allowed: bool) -> tuple[Mesh | np.ndarray, dict]:
-    """A clean mesh and what was dropped from it, or, of a PLY file without faces, (P, 3) finite points.
+    """Read a clean mesh and what was dropped from it, or (P, 3) finite points from a PLY file without faces.
 
     Raises:
-        LinprimError: unreadable, empty, or points where they are not allowed.
+        LinprimError: the file is unreadable or empty, or holds points where they are not allowed.
     """
     path = Path(path)
     if points_allowed and path.suffix.lower() == ".ply" and path.is_file():
@@ -80,14 +80,14 @@ def read_reference(path: str | os.PathLike, points_allowed: bool) -> tuple[Mesh 
 
 
 def read_observed_volume(mask: str | os.PathLike | None, box: str | None) -> ObservedVolume | None:
-    """The observation mask of a DTU scan, or a box alone; None without either.
+    """Read the observation mask of a DTU scan, or parse a box; return None without either.
 
     Args:
         mask: MATLAB file with `ObsMask` (a grid), `BB` (its two corners) and `Res` (its cells' edge).
         box: "x0,y0,z0,x1,y1,z1".
 
     Raises:
-        LinprimError: the file or the text is not of that form, or both are given.
+        LinprimError: the file or the text does not have that form, or both are given.
     """
     if mask is not None and box is not None:
         raise LinprimError(f"--box is {box}, but {mask} brings a box of its own; give one of them")
@@ -110,10 +110,12 @@ def read_observed_volume(mask: str | os.PathLike | None, box: str | None) -> Obs
 
 
 def read_plane(plane: str | os.PathLike) -> np.ndarray:
-    """(4,) a, b, c, d of the plane whose upper side is a x + b y + c z + d > 0: a MATLAB file's `P`, or text.
+    """Return (4,) a, b, c, d of a plane, from `P` in a MATLAB file or from text.
+
+    The upper side is where a x + b y + c z + d > 0.
 
     Raises:
-        LinprimError: neither a file with four numbers nor four numbers, or no direction in them.
+        LinprimError: neither a file with four numbers nor four numbers, or a, b, c are all zero.
     """
     text = os.fspath(plane)
     if Path(text).suffix.lower() == ".mat" or not _is_number(text.split(",")[0]):
@@ -126,13 +128,13 @@ def read_plane(plane: str | os.PathLike) -> np.ndarray:
 
 
 def read_crop(path: str | os.PathLike) -> CropVolume:
-    """The crop volume of a Tanks and Temples scene: JSON as Open3D's `SelectionPolygonVolume` writes it.
+    """Read the crop volume of a Tanks and Temples scene, JSON as Open3D's `SelectionPolygonVolume` writes it.
 
-    `orthogonal_axis` ("X", "Y" or "Z"), `axis_min`, `axis_max`, and `bounding_polygon`, a list of points of
-    three coordinates, of which the one along the axis does not count.
+    Its keys are `orthogonal_axis` ("X", "Y" or "Z"), `axis_min`, `axis_max`, and `bounding_polygon`, a list of points
+    with three coordinates, of which the one along the axis is ignored.
 
     Raises:
-        LinprimError: unreadable, or one of these is missing or unusable.
+        LinprimError: the file is unreadable, or a key is missing or has an unusable value.
     """
     try:
         values = json.loads(Path(path).read_text())
@@ -153,10 +155,10 @@ def read_crop(path: str | os.PathLike) -> CropVolume:
 
 
 def read_transform(path: str | os.PathLike) -> np.ndarray:
-    """(4, 4) similarity or affine map from a text file of four rows, the last one 0 0 0 1.
+    """Read a (4, 4) similarity or affine map from a text file of four rows, the last one 0 0 0 1.
 
     Raises:
-        LinprimError: unreadable, of another shape, or singular.
+        LinprimError: the file is unreadable, or the matrix has another shape or is singular.
     """
     try:
         matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)

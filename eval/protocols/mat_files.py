@@ -1,5 +1,5 @@
-"""Real arrays out of MATLAB files (version 5 to 7), by scipy in a process of its own: its reader crashes on some
-damaged files."""
+"""Reads real arrays from MATLAB files (version 5 to 7) by scipy, in a separate process, as scipy's reader crashes on
+some damaged files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 
-# Writes the arrays as npz, or one line about what is wrong and the exit status 1.
+# Writes the arrays as npz to stdout, or exits with status 1 and one line about the error.
 _READER = """
 import io, sys
 import numpy as np
@@ -32,17 +32,17 @@ sys.stdout.buffer.write(written.getvalue())
 
 
 def read_arrays(path: str | os.PathLike, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """{name: float64 array, or bool or whole numbers as stored} of real arrays in a MATLAB file.
+    """Return real arrays of a MATLAB file by name: float64, or bool or integers as stored.
 
     Raises:
-        LinprimError: unreadable, damaged, or one of them is not there.
+        LinprimError: the file is unreadable or damaged, or lacks one of them.
     """
     try:
         with open(path, "rb"):
             pass
     except OSError as error:
         raise LinprimError(f"{path}: cannot be read ({error.strerror or error})") from error
-    # -P: no module comes from the folder this was called in.
+    # -P: no module is imported from the current folder.
     done = subprocess.run([sys.executable, "-P", "-c", _READER, os.fspath(path), *names], capture_output=True)
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip() if done.returncode == 1 else "its reader crashes on it"

@@ -1,4 +1,4 @@
-"""The point sets that published mesh protocols score: lattices on triangles, thinned and averaged points."""
+"""The point sets that published mesh protocols score: lattices on triangles, thinned points, and means over cells."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ from linprim_geo.eval.surface_samples import corner_and_edges, morton_order
 from linprim_geo.geometry.mesh import Mesh
 
 MAX_POINTS = 60_000_000
-"""More than any published benchmark has; a protocol that asks for more has been given the wrong unit."""
+"""Largest number of points. No published benchmark has as many; a mesh that needs more has the wrong unit."""
 
 THIN_START = 100_000
-"""Points that `thin` takes in its first round; each later round takes as many as all before it."""
+"""Points of the first round of `thin`; each later round processes as many as all before it."""
 
 LATTICE_CHUNK = 4_000_000
-"""Lattice nodes made at a time: some 300 MB."""
+"""Lattice nodes computed at once: some 300 MB."""
 
 
 def lattice_points(mesh: Mesh, step: float) -> np.ndarray:
-    """(P, 3) points on a lattice along two edges of each face, one per `step` squared of its area.
+    """Return (P, 3) points on a lattice along two edges of each face, one per `step` squared of its area.
 
-    The edges a-b and a-c, of lengths l and m and with an angle whose sine is s, are cut into floor(l / h) and
-    floor(m / h) pieces with h = step / sqrt(s), so that a cell has the area step^2 or a little more; the
-    points are the centres of the cells that lie in the triangle. A face too small for one cell has no point.
+    The edges a-b and a-c, of lengths l and m and with an angle whose sine is s, are divided into floor(l / h) and
+    floor(m / h) pieces with h = step / sqrt(s), so that a cell has an area of step^2 or a little more. The points are
+    the centres of the cells that lie in the triangle. A face too small for one cell has no points.
 
     Raises:
+        LinprimError: there would be more than `MAX_POINTS`.
         LinprimError: more than `MAX_POINTS` would come out.
     """
     origin, edge_b, edge_c = corner_and_edges(mesh)
@@ -56,15 +57,15 @@ def lattice_points(mesh: Mesh, step: float) -> np.ndarray:
 
 
 def thin(points: np.ndarray, radius: float, seed) -> np.ndarray:
-    """Sorted indices of the points that stay when, in a random order, each one removes all within `radius`.
+    """Return the sorted indices of the points that remain when, in random order, each one removes all within `radius`.
 
-    The same as going through the shuffled points one by one: a point stays unless one before it has stayed
-    and is no further away than `radius`. It is done in rounds that each look at as many points as all rounds
-    before, so that memory does not grow with the density of the points.
+    The result is that of a loop over the shuffled points: a point remains unless one before it has remained and is no
+    farther away than `radius`. It is computed in rounds, each over as many points as all rounds before, so that memory
+    does not grow with the density of the points.
 
     Args:
         points: (P, 3) finite.
-        seed: of the shuffle, anything that `numpy.random.default_rng` takes.
+        seed: of the shuffle, any argument of `numpy.random.default_rng`.
     """
     from scipy.spatial import cKDTree
 
@@ -79,7 +80,7 @@ def thin(points: np.ndarray, radius: float, seed) -> np.ndarray:
             tree = cKDTree(points[kept])
             curve = morton_order(points[batch])
             found = np.empty(len(batch))
-            # The bound is exclusive, and a point at exactly the radius is removed too.
+            # The bound is exclusive, but a point at exactly the radius is removed too.
             bound = np.nextafter(radius, np.inf)
             found[curve] = tree.query(points[batch[curve]], distance_upper_bound=bound, workers=-1)[0]
             batch = batch[~(found <= radius)]
@@ -88,9 +89,9 @@ def thin(points: np.ndarray, radius: float, seed) -> np.ndarray:
 
 
 def _first_come(points: np.ndarray, radius: float) -> np.ndarray:
-    """(P,) bool: which points stay when each in turn removes all later ones within `radius`.
+    """Return (P,) bool: which points remain when each in turn removes all later ones within `radius`.
 
-    In parallel: a point that has no undecided neighbour before it stays and removes its neighbours.
+    Computed in parallel: a point without undecided earlier neighbours remains, and removes its neighbours.
     """
     from scipy.spatial import cKDTree
 
@@ -111,9 +112,9 @@ def _first_come(points: np.ndarray, radius: float) -> np.ndarray:
 
 
 def cell_means(points: np.ndarray, size: float) -> np.ndarray:
-    """(Q, 3) means of the points in each occupied cell of a cubic grid of edge `size`, in the cells' order.
+    """Return (Q, 3) means of the points in each occupied cell of a cubic grid of edge `size`, in cell order.
 
-    The grid begins half a cell below the smallest coordinates.
+    The grid starts half a cell below the smallest coordinates.
     """
     if len(points) == 0:
         return points
@@ -131,7 +132,7 @@ def cell_means(points: np.ndarray, size: float) -> np.ndarray:
 
 
 def check_count(count: float, what: str) -> int:
-    """`count` rounded up, at least 1.
+    """Return `count` rounded up, at least 1.
 
     Raises:
         LinprimError: it is more than `MAX_POINTS`.

@@ -1,8 +1,8 @@
-"""Mesh protocols of published tables, each from its description: for comparing with those tables, not for judging.
+"""Mesh protocols of published tables, each after its description, for comparison with these tables.
 
-They measure from points to points, so a perfect mesh does not score zero (of N independent points on an area
-A the mean distance is about sqrt(A / N) / 2), and some depend on how the mesh is triangulated. Each result
-names what was sampled, culled and kept.
+They do not measure quality as the headline protocol does: distances are from points to points, so a perfect mesh does
+not score zero (with N independent points on an area A the mean distance is about sqrt(A / N) / 2), and some depend on
+the triangulation. Each result states the sampling, the culling and the kept shares.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals, select_faces
 from linprim_geo.geometry.raycast import RayCaster
 
-DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal, where a protocol has no threshold of its own
+DEFAULT_TAU_SHARE = 0.01  # threshold of protocols without one of their own, as a share of the reference's diagonal
 
 LINPRIM_SAMPLES = 5000
 
-DTU_STEP, DTU_FAR = 0.2e-3, 20e-3  # metres: density of the points, and distances that are not counted
-DTU_BELOW, DTU_ABOVE = 60e-3, 120e-3  # metres by which the box of the mask is widened downwards and upwards
+DTU_STEP, DTU_FAR = 0.2e-3, 20e-3  # metres: spacing of the points, and distance from which on points are ignored
+DTU_BELOW, DTU_ABOVE = 60e-3, 120e-3  # metres by which the mask's box is extended downwards and upwards
 
 TNT_TAU = {
     "Barn": 0.01,
@@ -48,14 +48,14 @@ TNT_TAU = {
     "Meetingroom": 0.01,
     "Truck": 0.005,
 }
-"""Thresholds in metres of the Tanks and Temples training scenes."""
+"""Thresholds of the Tanks and Temples training scenes, in metres."""
 TNT_CELL = 0.5  # edge, in tau, of the cells whose points are averaged
 TNT_DENSITY = 4.0  # uniform points per tau squared; a perfect plane then has recall 0.99998
 
 RANDOM_SETS_ERROR = 2.0
-"""Where both point sets are independent random points, errors are stated as this times what independent
-distances would have: the other set is random too, and both directions share the sets, each worth a root of two.
-The spread over seeds was 0.5 to 0.9 of the result, where distances are all spacing and where they are not."""
+"""Factor on the standard error of independent distances where both point sets are independent random points. The other
+set is random too, and both directions share the sets; each contributes a root of two. The spread over seeds was 0.5 to
+0.9 of the result, both where distances are due to the spacing alone and where they are not."""
 
 SCANNETPP_EDGE, SCANNETPP_HIDDEN, SCANNETPP_TAU = 0.015, 0.02, 0.05  # metres
 SCANNETPP_VIEWS = 4  # "more than three"
@@ -65,7 +65,7 @@ SCANNETPP_MAX_FACES = 12_000_000
 
 @dataclass(frozen=True)
 class Settings:
-    """What a protocol is told. Lengths in the meshes' unit, of which `metre` make one metre."""
+    """The settings of a protocol. Lengths are in the meshes' unit; `metre` is the number of units in one metre."""
 
     metre: float = 1.0
     tau: float | None = None
@@ -80,7 +80,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Scored:
-    """Scores, and the two directions they come from."""
+    """Scores, and the distances of both directions from which they are computed."""
 
     results: dict
     forward: Comparison
@@ -94,18 +94,17 @@ def score_by_protocol(
     settings: Settings,
     unit: str = "unit of the meshes",
 ) -> Scored:
-    """Scores a mesh by one of `PROTOCOLS`, whose functions say what each does.
+    """Score a mesh by one of `PROTOCOLS`, described at their functions.
 
     Args:
         prediction: clean mesh.
         reference: clean mesh in the same frame; for `dtu` and `tnt` also (P, 3) points of a scan.
 
     Returns:
-        the scores under the names of the headline protocol; `published` lists those that the protocol is
-        known for, the rest follow from the same distances. `standard_error` is that of `chamfer`; it errs on
-        the safe side (points of a lattice are taken as independent ones). `samples` and `samples_reference`
-        count the points that were scored, `kept_prediction` and `kept_reference` are the shares that culling
-        left.
+        the scores under the names of the headline protocol; `published` lists the scores of the published
+        protocol, the rest follow from the same distances. `standard_error` is the one of `chamfer`; it is an upper
+        estimate (lattice points are treated as independent ones). `samples` and `samples_reference` count the scored
+        points; `kept_prediction` and `kept_reference` are the shares that remain after culling.
 
     Raises:
         LinprimError: culling leaves nothing, or a setting that the protocol needs is missing.
@@ -127,10 +126,10 @@ def score_by_protocol(
 
 
 def score_linprim(prediction: Mesh, reference: Mesh, settings: Settings, default_tau: float) -> Scored:
-    """Chamfer distance of 5,000 independent uniform points on each mesh, nearest point to nearest point.
+    """Compute the Chamfer distance between 5,000 independent uniform points on each mesh, by nearest points.
 
-    Source: LinPrim (von Luetzow and Niessner, NeurIPS 2025), table 10. Its meshes are fused from predicted depth at 5
-    cm voxels: that is `extract-mesh --voxel-size 0.05`, not done here. The paper does not say whether its Chamfer
+    Source: LinPrim (von Luetzow and Niessner, NeurIPS 2025), table 10. Its meshes are fused from predicted depth with
+    5 cm voxels, which is `extract-mesh --voxel-size 0.05` and not done here. The paper does not say whether its Chamfer
     distance is the mean of the two directions, as here, or their sum, twice as much.
     """
     tau = settings.tau or default_tau
@@ -150,14 +149,13 @@ def score_linprim(prediction: Mesh, reference: Mesh, settings: Settings, default
 
 
 def score_dtu(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float) -> Scored:
-    """Mean distances of the DTU benchmark as it is computed for meshes.
+    """Compute the mean distances of the DTU benchmark in the form used for meshes.
 
-    The prediction becomes its vertices and a lattice of 0.2 mm on each face, thinned in a random order until
-    no two points are within 0.2 mm. Of these, those within the mask's box, widened by 60 mm below and 120 mm
-    above, are what the reference is compared with; those that also lie in an observed cell of the mask are
-    compared with the whole reference. Of the reference those above the plane count. Distances from 20 mm on
-    are left out of the means. A reference that is a mesh becomes points in the same way; points of a scan are
-    taken as they are.
+    The prediction is sampled at its vertices and on a lattice of 0.2 mm on each face, and thinned in random order until
+    no two points are within 0.2 mm. The reference is compared with those of these points that lie in the mask's box,
+    extended by 60 mm below and 120 mm above. Those that also lie in an observed cell of the mask are compared with the
+    whole reference. Of the reference only points above the plane are scored. Distances of 20 mm and more are left out
+    of the means. A reference mesh is sampled in the same way; points of a scan are used unchanged.
 
     A perfect plane scores about 0.1 mm, more or less by how it is triangulated.
 
@@ -201,14 +199,14 @@ def score_dtu(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings
 
 
 def score_tnt(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings, default_tau: float) -> Scored:
-    """Precision, recall and F1 of Tanks and Temples at the scene's threshold tau; nothing is registered here.
+    """Compute precision, recall and F1 of Tanks and Temples at the scene's threshold tau, without registration.
 
-    Both point sets are cut to the crop volume and averaged in cells of tau / 2; a point counts if the nearest
-    one of the other set is nearer than tau. The prediction's points are the vertices and the centroids of the
-    faces, as is common for meshes: a mesh with edges longer than tau then has less recall than its surface
-    deserves (0.23 for a perfect plane of equilateral triangles of 4 tau by its vertices alone, 0.68 with the
-    centroids). `uniform_points` holds the same scores of uniform points, 4 per tau squared, which do not
-    depend on the triangulation. A reference that is a mesh is sampled by uniform points too.
+    Both point sets are cropped to the crop volume and averaged in cells of tau / 2. A point counts as correct if the
+    nearest point of the other set is nearer than tau. The prediction's points are its vertices and the centroids of its
+    faces, as is common for meshes. A mesh with edges longer than tau then has a lower recall than its surface (0.23 for
+    a perfect plane of equilateral triangles of 4 tau by its vertices alone, 0.68 with the centroids). `uniform_points`
+    holds the same scores with uniform points, 4 per tau squared, which do not depend on the triangulation. A reference
+    mesh is sampled with uniform points too.
 
     Source: Knapitsch et al., SIGGRAPH 2017, section 4.
     """
@@ -256,12 +254,12 @@ def score_tnt(prediction: Mesh, reference: Mesh | np.ndarray, settings: Settings
 
 
 def score_scannetpp(prediction: Mesh, reference: Mesh, settings: Settings, default_tau: float) -> Scored:
-    """Accuracy, completeness, Chamfer-L1, normal consistency and F1 at 5 cm of what the cameras see.
+    """Compute accuracy, completeness, Chamfer-L1, normal consistency and F1 at 5 cm of the parts that cameras see.
 
-    Both meshes are refined until no edge is longer than 1.5 cm. A vertex is seen by a camera if it lies in the
-    image and its own mesh has nothing more than 2 cm before it on the ray; faces whose three vertices are each
-    seen by more than three cameras stay. One uniform point per square centimetre of what stays, nearest point
-    to nearest point, normals of their faces without sign. `kept_*` are shares of the areas.
+    Both meshes are refined until no edge is longer than 1.5 cm. A camera sees a vertex if it projects into the image
+    and no face of its own mesh is more than 2 cm in front of it. Faces whose three vertices are each seen by more than
+    three cameras are kept, and sampled with one uniform point per square centimetre. Distances are between nearest
+    points; normals are those of the faces, without sign. `kept_*` are shares of the areas.
     """
     if not settings.cameras:
         raise LinprimError("protocol scannetpp culls by cameras: give a scene's folder with --cameras, or --run")
@@ -297,10 +295,10 @@ PROTOCOLS: dict[str, Callable[..., Scored]] = {
 }
 
 TAKES_POINTS = ("dtu", "tnt")
-"""Protocols whose reference may be the points of a scan."""
+"""Protocols that accept the points of a scan as reference."""
 
 METERS_PER_UNIT = {"dtu": 1e-3, "tnt": 1.0, "scannetpp": 1.0}
-"""Unit of the benchmark's own meshes, for the protocols that have lengths of their own."""
+"""Unit of the benchmark's own meshes in metres, for protocols with absolute lengths."""
 
 
 @dataclass(frozen=True)
@@ -339,9 +337,9 @@ def _tnt_tau(scene: str) -> float:
 
 
 def _seen_part(mesh: Mesh, name: str, cameras: Sequence[Camera], metre: float) -> tuple[Mesh, int]:
-    """The refined faces that enough cameras see, and how many rays were re-cast."""
+    """Return the refined faces that enough cameras see, and the number of re-cast rays."""
     edge = SCANNETPP_EDGE * metre
-    # No triangle with edges up to this long is larger than the equilateral one.
+    # Among triangles with edges up to this length, the equilateral one is largest.
     enough = float(face_areas(mesh).sum()) < SCANNETPP_MAX_FACES * edge**2 * math.sqrt(3.0) / 4.0
     fine = refine(mesh, edge, SCANNETPP_MAX_FACES) if enough else mesh
     longest = float(longest_edges(fine).max())

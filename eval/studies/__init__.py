@@ -1,1 +1,1 @@
-"""Studies that make the tables of the documents."""
+"""Studies that make the tables of the documentation."""

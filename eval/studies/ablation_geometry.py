@@ -43,7 +43,7 @@ VARIANTS: dict[str, dict] = {
     "sensor depth": {"sensor_depth": 1.0},
     "sensor depth+normals": {"sensor_depth": 1.0, "sensor_normals": 0.1},
 }
-# Points per surface: the standard error of a Chamfer distance is about 0.5 % of it.
+# Sample points per surface. The standard error of a Chamfer distance is then about 0.5 % of it.
 SAMPLES = 30_000
 BUILT_IN = ("cad", "smooth", "room", "wires")
 COLUMNS = {
@@ -57,8 +57,8 @@ COLUMNS = {
 
 
 def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options: SceneOptions) -> None:
-    """Trains with photographs alone unless the folder holds that run; leaves the checkpoint where the terms would have
-    begun."""
+    """Train with photographs alone, unless the folder holds that run; keep the checkpoint of the step from which on
+    variants use further terms."""
     from linprim_geo.training.train import train
 
     if (folder / "run.json").exists():
@@ -68,7 +68,7 @@ def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options
 
 
 def train_variant(base: Path, folder: Path, changed: dict) -> None:
-    """Repeats the last part of `base` with other options, unless the folder holds that run; leaves its CPU seconds in
+    """Repeat the last part of `base` with other options, unless the folder holds that run; write its CPU seconds to
     `seconds.json`."""
     from linprim_geo.runs.run import Run
     from linprim_geo.training.train import train
@@ -94,12 +94,12 @@ def train_variant(base: Path, folder: Path, changed: dict) -> None:
 
 
 def branch_step(options: TrainOptions) -> int:
-    """The step from which variants differ: where the terms join the loss."""
+    """Return the step from which on variants differ: where the terms join the loss."""
     return round(options.geometry_from * options.iterations)
 
 
 def score(folder: Path, reference: Path | None, methods: tuple[str, ...]) -> dict:
-    """The row of one trained variant."""
+    """Return the scores of one trained variant."""
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
     from linprim_geo.eval.mesh import score_mesh
@@ -128,7 +128,8 @@ def score(folder: Path, reference: Path | None, methods: tuple[str, ...]) -> dic
 
 
 def ratios(rows: dict[str, dict[str, dict]]) -> dict[str, dict]:
-    """Per variant the median over the scenes of each figure over the plain run's; of PSNR the difference in dB."""
+    """Return, for each variant, the median over scenes of each score divided by that of the plain run; for PSNR the
+    difference in dB."""
     from statistics import median
 
     summary: dict[str, dict] = {}
@@ -146,7 +147,7 @@ def ratios(rows: dict[str, dict[str, dict]]) -> dict[str, dict]:
 
 
 def table(title: str, rows: dict[str, dict]) -> str:
-    """A Markdown table of one scene, or of the medians."""
+    """Return a Markdown table of one scene, or of the medians."""
     names = [name for name in COLUMNS if any(name in row for row in rows.values())]
     lines = [
         f"### {title}",
@@ -192,7 +193,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Everything that the command does."""
+    """Run the whole command."""
     from linprim_geo.synthetic.synth import synthesize
 
     if given.references and len(given.references) != len(given.data):

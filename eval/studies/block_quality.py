@@ -36,8 +36,8 @@ COLUMNS = {
 
 
 def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
-    """(P,) distance of points (P, 3) to the nearest border of the block that holds each; infinite where there is
-    none."""
+    """Return (P,) the distance of (P, 3) points to the nearest border of the block that contains each; infinite where
+    there is none."""
     found = np.full(len(xyz), np.inf)
     for block in blocks:
         inside = block.holds(xyz)
@@ -47,7 +47,7 @@ def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
 
 
 def borders(run: Path) -> tuple[list, float]:
-    """The blocks of a run and their margin, in the training frame."""
+    """Return the blocks of a run and their margin, in the training frame."""
     from linprim_geo.training.blocks.plan import read_plan
 
     plan = read_plan(run)
@@ -55,8 +55,8 @@ def borders(run: Path) -> tuple[list, float]:
 
 
 def score(run: Path, reference: Path, blocks, margin: float) -> dict:
-    """Chamfer distance of what cameras see, and of points within a margin of the borders and elsewhere, whether seen or
-    not."""
+    """Return the Chamfer distance of the visible parts, and the mean distances of points within a margin of the borders
+    and of the others, visible or not."""
     from linprim_geo.eval.mesh import score_mesh
     from linprim_geo.eval.surface_samples import SurfaceDistance, sample_surface
     from linprim_geo.geometry.mesh import clean_mesh
@@ -83,7 +83,7 @@ def score(run: Path, reference: Path, blocks, margin: float) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown."""
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
         cells = [f"{row[name]:.4g}" if isinstance(row[name], float) else str(row[name]) for name in COLUMNS]
@@ -92,7 +92,7 @@ def table(rows: list[dict]) -> str:
 
 
 def run(given: argparse.Namespace) -> list[dict]:
-    """Does what is not done yet, and writes the table."""
+    """Run the missing trainings, score all of them, and write the table."""
     from linprim_geo.base.progress import Progress
     from linprim_geo.eval.studies.street import street
     from linprim_geo.jobs.executor import Task
@@ -118,7 +118,7 @@ def run(given: argparse.Namespace) -> list[dict]:
     for count in counts:
         folder = output / f"blocks_{count}"
         where = {"scene": str(scene.resolve()), "options": options, "blocks": count, "workers": given.workers}
-        if count == 1:  # in a worker too, so that its memory is measured alike
+        if count == 1:  # in a worker too, so that its memory is measured in the same way
             with open_executor(None, output, 1) as executor:
                 executor.run(
                     [Task("whole", "linprim_geo.eval.studies.block_quality:train_task", where, folder)],
@@ -144,7 +144,7 @@ def run(given: argparse.Namespace) -> list[dict]:
 
 
 def train_task(folder: Path, scene: str, options: dict, blocks: int, workers: int) -> dict:
-    """Trains into folder/run, in blocks or whole."""
+    """Train into folder/run, in blocks or as a whole."""
     from linprim_geo.training.train import train
 
     chosen = TrainOptions(**options, threads=1)

@@ -31,12 +31,12 @@ from linprim_geo.stereo.confidence import RIGHT, probability
 from linprim_geo.stereo.dense.maps_from_disk import seen_depths
 from linprim_geo.stereo.dense.planes_on_disk import STAGES, Photographs, PlanesOnDisk
 
-# Pixels of each photograph that are kept for fitting and scoring: errors of neighbouring ones are nearly the same.
+# Pixels per photograph that are kept for fitting and scoring; neighbouring pixels have nearly equal errors.
 PIXELS = 8000
 BINS = 10
-# Of a depth where the mesh has none.
+# Error of a depth at a pixel where the mesh has no surface.
 NO_SURFACE = np.float32(np.inf)
-# Steps of Newton's method.
+# Number of Newton steps.
 STEPS = 30
 COLUMNS = {
     "name": "capture",
@@ -52,7 +52,7 @@ COLUMNS = {
 
 
 def measure(capture: Path, reference: Path, folder: Path, photographs: int, threads: int) -> dict:
-    """Stereo of a capture: (N, 6) `evidence` and (N,) `error` of sampled depths, and figures of all of them."""
+    """Run stereo on a capture; return (N, 6) `evidence` and (N,) `error` of sampled depths, and statistics of all."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.geometry.raycast import RayCaster
@@ -90,12 +90,12 @@ def measure(capture: Path, reference: Path, folder: Path, photographs: int, thre
         "photographs": len(views),
         "size": f"{camera.width}x{camera.height}",
         "coverage": covered / surface,
-        "core_seconds": seconds / len(views) if fresh else np.nan,  # else not all of it was done now
+        "core_seconds": seconds / len(views) if fresh else np.nan,  # NaN if results of an earlier run were reused
     }
 
 
 def row(name: str, measured: dict) -> dict:
-    """The figures of a capture by the present weights."""
+    """Return the scores of a capture with the present weights."""
     error, predicted = measured["error"], probability(measured["evidence"])
     return {
         "name": name,
@@ -108,8 +108,8 @@ def row(name: str, measured: dict) -> dict:
 
 
 def reliability(captures: list[dict]) -> list[dict]:
-    """Per bin of the prediction: the share of the pixels in it, mean prediction, share that is right, and how far these
-    are off; all captures count the same."""
+    """Return, for each bin of the predicted probability, the share of the pixels in it, the mean prediction, the share
+    of correct depths, and the difference of the last two. All captures have equal weight."""
     predicted = np.concatenate([probability(each["evidence"]) for each in captures])
     right = np.concatenate([each["error"] < RIGHT for each in captures])
     weight = _equal(captures)
@@ -133,7 +133,7 @@ def reliability(captures: list[dict]) -> list[dict]:
 
 
 def fit(captures: list[dict]) -> np.ndarray:
-    """(6,) weights of the most likely logistic law; all captures count the same."""
+    """Return (6,) weights of the logistic law with the largest likelihood. All captures have equal weight."""
     evidence = np.concatenate([each["evidence"] for each in captures]).astype(np.float64)
     right, weight = np.concatenate([each["error"] < RIGHT for each in captures]), _equal(captures)
     weights = np.zeros(evidence.shape[1])
@@ -145,13 +145,13 @@ def fit(captures: list[dict]) -> np.ndarray:
 
 
 def _equal(captures: list[dict]) -> np.ndarray:
-    """A weight for each pixel by which captures count the same, of sum 1."""
+    """Return weights of the pixels, of sum 1, by which all captures have equal weight."""
     counts = [len(each["error"]) for each in captures]
     return np.concatenate([np.full(count, 1 / (count * len(captures))) for count in counts])
 
 
 def table(rows: list[dict], columns: dict[str, str]) -> str:
-    """Markdown."""
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(columns.values()) + " |", "|---" * len(columns) + "|"]
     for each in rows:
         cells = [f"{each[key]:.3f}" if isinstance(each[key], float) else str(each[key]) for key in columns]
@@ -161,7 +161,7 @@ def table(rows: list[dict], columns: dict[str, str]) -> str:
 
 
 def report(captures: dict[str, dict], fitted: list[str]) -> str:
-    """All tables."""
+    """Return all tables."""
     text = table([row(name, each) for name, each in captures.items()], COLUMNS)
     columns = {"bin": "predicted", "share": "share of the pixels", "predicted": "mean", "right": "right within 1 %"}
     for title, names in (
@@ -195,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Everything that the command does."""
+    """Run the whole command."""
     references = given.references or [capture / "reference.ply" for capture in given.data]
     if len(references) != len(given.data):
         raise LinprimError(f"{len(references)} references go with {len(given.data)} captures, wanted one for each")

@@ -42,7 +42,7 @@ from linprim_geo.training.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
 PLAIN = {"shape": "smooth", "shading": "shaded"}
-# name of a built-in scene: what it has beside PLAIN.
+# By the name of a built-in scene: its settings in addition to PLAIN.
 SCENES = {
     "plain": {},
     "highlights": {"specular": 0.4},
@@ -58,7 +58,7 @@ SCENES = {
     "wires": {"shape": "wires", "shading": "shaded"},
     "tabletop": {"table": 2.5, "environment": 4, "noise": 2.0},
 }
-# name: the scenes that call for it, those that do not, and by what the gain is judged.
+# By the name of an effect: the scenes that need it, those that do not, and the score by which it is judged.
 PAIRS = {
     "view-dependence": (("highlights",), ("plain",), "psnr"),
     "exposure": (("exposure",), ("room",), "psnr"),
@@ -73,8 +73,8 @@ PAIRS = {
     "exact-rays": (("room",), ("telephoto",), "psnr"),
     "double": ((), ("plain",), "psnr"),
 }
-# What is compared with what everything costs; measured depth and normals are truth in built-in scenes, so all there is
-# without them, too.
+# The ways of choosing effects that are compared. Measured depth and normals are exact in built-in scenes, so one way is
+# all effects without them.
 WAYS = {
     "auto": Choice("auto"),
     "none": Choice("none"),
@@ -83,13 +83,13 @@ WAYS = {
 }
 AUTO_OR_ALL = ("plain", "cad", "room", "wires")
 QUIET = {"threads": 1, "evaluate_every": 0, "checkpoint_every": 10**9}
-# What trainings are judged by, and whether more or less of it is better.
+# Scores of trainings, with 1 where larger is better and -1 where smaller is.
 JUDGED = {"psnr": 1, "depth": -1}
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is."""
+    """The sizes of all trainings."""
 
     pixels: int
     iterations: int
@@ -97,12 +97,13 @@ class Size:
 
 
 def all_off() -> dict:
-    """The options of a training without any effect."""
+    """Return the options of a training without any effect."""
     return {name: value for effect in EFFECTS.values() for name, value in effect.off.items()}
 
 
 def base_options(size: Size) -> tuple[SceneOptions, TrainOptions]:
-    """Options with every effect off but what costs nothing and is on as a rule: exact rays, masks and the lens."""
+    """Return options with all effects off, except those that cost nothing and are on by default: exact rays, masks and
+    the lens."""
     off = {k: v for k, v in all_off().items() if k in TrainOptions.__dataclass_fields__} | EFFECTS["exact-rays"].on
     options = TrainOptions(
         iterations=size.iterations,
@@ -114,7 +115,7 @@ def base_options(size: Size) -> tuple[SceneOptions, TrainOptions]:
 
 
 def make_scene(folder: Path, name: str, size: Size) -> Path:
-    """The built-in scene, made unless it is there."""
+    """Create the built-in scene unless it exists; return its folder."""
     path = folder / "scenes" / name.replace(" ", "_")
     if not (path / "synth.json").is_file():
         settings = {**PLAIN, **SCENES[name]}
@@ -132,8 +133,8 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
 
 
 def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]) -> dict:
-    """PSNR, the same with gains (`psnr_with_gains`), depth error in percent (if there is truth, a mesh or depth images)
-    and CPU seconds of a training; taken from the folder if it is there."""
+    """Train, or read the result of an earlier call from the folder. Return PSNR, the same with gains
+    (`psnr_with_gains`), the depth error in percent (given a reference mesh or depth images) and CPU seconds."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_scores.json"
     if result.is_file():
@@ -152,8 +153,8 @@ def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple
 
 
 def psnr_with_gains(run: Path) -> float:
-    """Mean PSNR of held-out views, each render times the gain per channel that brings it nearest to its photograph:
-    whose exposure nothing else can tell."""
+    """Return the mean PSNR of held-out views after scaling each render by the gain per channel that fits its photograph
+    best, as the exposure of a held-out photograph is unknown."""
     opened = Run.open(run)
     background = np.asarray(opened.background, np.float64)
     scores = []
@@ -167,8 +168,8 @@ def psnr_with_gains(run: Path) -> float:
 
 
 def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: int) -> list[dict]:
-    """Trainings with an effect on or off and everything else off, one for each seed. What changes no option is the same
-    training."""
+    """Train with an effect on or off and all others off, once for each seed. A setting that changes no option uses the
+    common base training."""
     rows = []
     for seed in range(seeds):
         base = tuple(
@@ -183,14 +184,14 @@ def switched(folder: Path, path: Path, name: str, on: bool, size: Size, seeds: i
 
 @cache
 def decisions(path: Path, size: Size) -> dict[str, Decision]:
-    """What the data of a scene say about every effect."""
+    """Return the decisions of the detector about every effect of a scene."""
     scene_options, options = base_options(size)
     loaded = start_points.with_points(load_scene(path), options, lambda text: None)
     return {found.name: found for found in decide(loaded, scene_options, options, Choice("auto"))}
 
 
 def judge(folder: Path, name: str, size: Size, seeds: int) -> list[dict]:
-    """The rows of an effect, one for each of its scenes."""
+    """Return the rows of an effect, one for each of its scenes."""
     called, not_called, by = PAIRS[name]
     rows = []
     for scene in (*called, *not_called):
@@ -218,16 +219,15 @@ def judge(folder: Path, name: str, size: Size, seeds: int) -> list[dict]:
 
 
 def mean(rows: list[dict], name: str) -> float:
-    """Of a figure over trainings."""
+    """Return the mean of a score over trainings."""
     return sum(row[name] for row in rows) / len(rows)
 
 
 def scatter(trainings: list[list[dict]], name: str) -> float | None:
-    """Standard deviation of a figure over trainings that differ in their seed alone, from the median over what was
-    trained; None of one.
+    """Return the standard deviation of a score over trainings that differ only in the seed, from the median variance
+    over groups of such trainings; None if all groups have one training.
 
-    The median of the variances, which are chi-squared over their k degrees of freedom, is their mean times (1 - 2 /
-    9k)^3.
+    The variances are chi-squared over their k degrees of freedom; their median is their mean times (1 - 2 / 9k)^3.
     """
     variances = {}
     for rows in trainings:
@@ -241,7 +241,7 @@ def scatter(trainings: list[list[dict]], name: str) -> float | None:
 def compare_modes(
     folder: Path, path: Path, size: Size, seeds: int, downscale: int = 1, ways: Sequence[str] = tuple(WAYS)
 ) -> dict:
-    """Trainings in some of WAYS; all other options are the defaults."""
+    """Train with some of WAYS; all other options are the defaults."""
     found: dict = {"scene": path.name}
     for way, choice in ((way, WAYS[way]) for way in ways):
         found[way] = []
@@ -253,7 +253,7 @@ def compare_modes(
 
 
 def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
-    """Both tables as Markdown, and below the first what trainings scatter by."""
+    """Return both tables as Markdown, and below the first the standard deviation of trainings."""
     lines = []
     if rows:
         lines = [
@@ -295,11 +295,11 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
 
 
 def verdict(row: dict, spread: dict, seeds: int) -> str:
-    """Whether a decision is right by what the effect is judged by; a change counts that is more than twice its standard
-    error.
+    """Return whether a decision is right by the score that judges the effect. A change counts if it is more than twice
+    its standard error.
 
-    Where nothing calls for the effect, what it gains by that does not count if it loses as much, in standard errors, by
-    the other.
+    In a scene that does not need the effect, a gain in that score does not count if the other score loses as much, in
+    standard errors.
     """
     if row["reason"] == "impossible":
         return "ruled out"

@@ -32,9 +32,9 @@ from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 from linprim_geo.eval.studies.surfaces import score
 from linprim_geo.eval.study_tables import write_table
 
-# Photographs that training and scores have; of them `views` are for training but on the rungs of few.
+# Numbers of photographs for training and for scores; rungs of few photographs change the first.
 VIEWS, TEST_VIEWS, POINTS = 40, 6, 5000
-# A table three times as wide as the object, and a room at infinity: a background near and far, without masks.
+# A table three times as wide as the object in a room at infinity: near and distant background, without masks.
 AROUND_OBJECT: dict[str, Any] = {"table": 3.0, "environment": 3, "path": "hemisphere"}
 SCENES: dict[str, dict[str, Any]] = {"cad": AROUND_OBJECT, "smooth": AROUND_OBJECT, "room": {}}
 IDEAL, MASKS = "ideal", "masks, no background"
@@ -75,7 +75,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Size:
-    """How large everything is."""
+    """The sizes of all captures and trainings."""
 
     pixels: int
     iterations: int
@@ -84,14 +84,15 @@ class Size:
 
 
 def settings_of(scene: str, rung: str) -> dict[str, Any] | None:
-    """How `synth` photographs a scene on a rung; None where there is no such rung, as of masks in a room."""
+    """Return the settings of `synth` for a scene on a rung; None if the scene has no such rung, such as masks in a
+    room."""
     if rung == MASKS:
         return {} if SCENES[scene] else None
     return SCENES[scene] | RUNGS[rung]
 
 
 def measured(folder: Path, scene: str, settings: dict[str, Any], label: str, size: Size) -> dict:
-    """One row: the capture is made, trained and meshed in `folder`."""
+    """Create, train and mesh a capture in `folder`; return its row."""
     from linprim_geo.synthetic.synth import synthesize
     from linprim_geo.training.train import train
 
@@ -117,7 +118,7 @@ def measured(folder: Path, scene: str, settings: dict[str, Any], label: str, siz
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown, with the Chamfer distance of each rung divided by that of ideal photographs of the same scene."""
+    """Return a Markdown table, with each Chamfer distance also divided by that of ideal photographs of the scene."""
     ideal = {row["scene"]: row["chamfer"] for row in rows if row["rung"] == IDEAL}
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
@@ -151,7 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Everything that the command does."""
+    """Run the whole command."""
     size, rows = Size(given.size, given.iterations, given.max_primitives, given.seed), []
     for scene in given.scenes:
         for rung in given.rungs:

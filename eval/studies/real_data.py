@@ -2,8 +2,9 @@
 
     python -m linprim_geo.eval.studies.real_data --data DIR -o runs/real
 
-A capture is any sub-folder that `load_scene` reads. Its reference is a mesh `reference.ply` or ScanNet++'s in it, or
-`DIR/meshes/NAME.*` whose NAME the folder's name begins with; depth is scored where the held-out views bring depth maps.
+A capture is any sub-folder that `load_scene` reads. Its reference mesh is `reference.ply` or ScanNet++'s mesh in it, or
+`DIR/meshes/NAME.*` where NAME is the beginning of the folder's name. Depth is scored if the held-out views have depth
+maps.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from linprim_geo.jobs.open import open_executor
 
 
 def captures(data: Path, only: list[str]) -> list[Path]:
-    """Sub-folders of `data` (or `data` itself) that hold posed images, by name; `only` names those wanted."""
+    """Return the sub-folders of `data` (or `data` itself) that hold posed images, sorted by name; `only` selects some
+    by name."""
     from linprim_geo.capture.load import load_scene
 
     found = []
@@ -50,7 +52,7 @@ def captures(data: Path, only: list[str]) -> list[Path]:
 
 
 def reference_of(capture: Path, data: Path) -> Path | None:
-    """The mesh a capture is scored against, if there is one."""
+    """Return the reference mesh of a capture, if there is one."""
     for name in ("reference.ply", "scans/mesh_aligned_0.05.ply"):  # the second is ScanNet++'s
         if (capture / name).exists():
             return capture / name
@@ -63,7 +65,7 @@ def reference_of(capture: Path, data: Path) -> Path | None:
 
 
 def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
-    """Trains, meshes and scores one capture; every key of the result is a column of the table or a file."""
+    """Train, mesh and score one capture; every key of the result is a column of the table or a file."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
@@ -109,7 +111,7 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
 
 
 def tried(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
-    """The row of a capture, or what is wrong with it as `error`: the others are done all the same."""
+    """Return the row of a capture, or its `error`, so that the other captures are still processed."""
     try:
         return run_capture(capture, data, output, options, scene_options)
     except LinprimError as error:
@@ -117,16 +119,16 @@ def tried(capture: Path, data: Path, output: Path, options: TrainOptions, scene_
 
 
 def capture_task(folder: Path, capture: str, data: str, output: str, options: dict, scene_options: dict) -> dict:
-    """The same by a worker, on one core."""
+    """Run `tried` in a worker, on one core."""
     how = TrainOptions(**options | {"threads": 1})
-    with redirect_stdout(sys.stderr):  # a worker answers on stdout
+    with redirect_stdout(sys.stderr):  # stdout of a worker is for its result
         return tried(Path(capture), Path(data), Path(output), how, SceneOptions(**scene_options))
 
 
 def by_workers(
     found: list[Path], args: argparse.Namespace, options: TrainOptions, scene_options: SceneOptions
 ) -> list[dict]:
-    """The rows of all captures, several at a time."""
+    """Return the rows of all captures, several processed at a time."""
     args.output.mkdir(parents=True, exist_ok=True)
     given = {"data": str(args.data.resolve()), "output": str(args.output.resolve()), "options": asdict(options)}
     given |= {"scene_options": asdict(scene_options)}
@@ -141,7 +143,7 @@ def by_workers(
 
 
 def table(rows: list[dict]) -> str:
-    """The rows as a Markdown table; figures without a truth to compare with are dashes."""
+    """Return the rows as a Markdown table; scores without ground truth are dashes."""
     columns = [
         ("capture", "name", "{}"),
         ("views", "views", "{}"),
@@ -162,7 +164,8 @@ def table(rows: list[dict]) -> str:
 
 
 def curves(rows: list[dict]) -> str:
-    """One line per capture: held-out PSNR over seconds of training (during it, of a part of the held-out views)."""
+    """Return one line per capture: held-out PSNR over seconds of training (during it, of a part of the held-out
+    views)."""
     return "\n".join(
         f"* {row['name']}: " + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
         for row in rows

@@ -31,24 +31,24 @@ from linprim_geo.base.files import read_json, write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 
 DRIFT = {"cad": 0.2, "smooth": 0.0, "room": 0.2}
-"""The scenes, and how much the exposure of each drifts, see `SynthOptions.exposure_drift`."""
+"""The scenes, and the exposure drift of each, see `SynthOptions.exposure_drift`."""
 
 OPTIONS = TrainOptions(iterations=1500, max_primitives=2000, sh_degree=1, threads=1, evaluate_every=0)
 
 TIMED_FROM, TIMED_EVERY = 1300, 5
-"""From this step on every so many are timed."""
+"""The first timed step, and the interval of timed steps."""
 
 SAMPLES = 50_000
-"""Points per surface: the standard error of a Chamfer distance is about 0.4 % of it."""
+"""Sample points per surface. The standard error of a Chamfer distance is then about 0.4 % of it."""
 
 FALSE_ALARMS = 1e-3
-"""Probability that a result lies outside its band though nothing has changed."""
+"""Probability that an unchanged training has a result outside its band."""
 
 
 def measure(scene: str, seed: int, folder: Path) -> dict:
-    """The row of one training; the capture and the run are written to `folder`.
+    """Return the row of one training; the capture and the run are written to `folder`.
 
-    The capture is the same for every seed, and for every instruction set but for rounding.
+    The capture is the same for every seed, and up to rounding for every instruction set.
     """
     from linprim_geo.eval.mesh import score_mesh
     from linprim_geo.geometry.mesh_files import load_mesh
@@ -91,7 +91,7 @@ def measure(scene: str, seed: int, folder: Path) -> dict:
 
 
 class StepTiming:
-    """Makes steps in place of `Trainer.advance`, and times some of those after TIMED_FROM."""
+    """Runs steps in place of `Trainer.advance`, and times some of those from TIMED_FROM on."""
 
     def __init__(self):
         self.ratios: list[float] = []
@@ -108,14 +108,14 @@ class StepTiming:
             self.ratios.append(1e9 * seconds / (pairs * (limits["pair_forward_ns"] + limits["pair_backward_ns"])))
 
     def over_limit(self) -> float:
-        """CPU seconds of a step over those that the core's limits give its pairs: what a tenth of the steps undercut,
-        as other work on the machine slows down most of them."""
+        """Return the CPU seconds of a step divided by the seconds that the core's limits imply for its pairs: the 10 %
+        quantile over steps, as other work on the machine slows down most of them."""
         return float(np.quantile(self.ratios, 0.1))
 
 
 def band(values: Sequence[float]) -> tuple[float, float]:
-    """Between which values one more of the same normal distribution lies, but for FALSE_ALARMS: the prediction interval
-    of Student's t. At least three values."""
+    """Return the prediction interval of Student's t: another value of the same normal distribution is outside of it
+    with probability FALSE_ALARMS. Needs at least three values."""
     from scipy.stats import t
 
     if len(values) < 3:
@@ -144,10 +144,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """The rows of a file that `add_row` wrote.
+    """Return the rows of a file written by `add_row`.
 
     Raises:
-        LinprimError: it cannot be read, or holds no list.
+        LinprimError: the file cannot be read, or holds no list.
     """
     rows = read_json(path, "rows of trainings")
     if not isinstance(rows, list):
@@ -156,7 +156,7 @@ def read_rows(path: Path) -> list[dict]:
 
 
 def add_row(path: Path, row: dict) -> None:
-    """Writes a row into a file of rows, in the place of one of the same training."""
+    """Write a row to a file of rows, in place of a row of the same training."""
     rows = read_rows(path) if path.exists() else []
     same = ("scene", "instruction_set", "seed")
     rows = [other for other in rows if any(other[name] != row[name] for name in same)] + [row]

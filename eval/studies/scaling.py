@@ -28,7 +28,7 @@ from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.study_tables import write_table
 
-# (photographs, downscale, primitives) of a capture of 1024x1024; the last is what the fit is checked on.
+# (photographs, downscale, primitives) for a capture of 1024x1024; the last size is not fitted, but checks the fit.
 SIZES = (
     (20, 1, 4000),
     (20, 1, 40_000),
@@ -44,24 +44,24 @@ SIZES = (
 STEPS, WARM_UP = 30, 5
 SIDE, VIEWS = 1024, 160
 BYTES_OF_PHOTO = 0.5
-"""Bytes per pixel of a photograph as a JPEG of good quality: an assumption, not measured here."""
+"""Bytes per pixel of a photograph, assumed for a JPEG of good quality; not measured here."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """What is assumed of a capture whose cost is predicted."""
+    """The assumptions about a capture whose cost is predicted."""
 
     pixels: int = 2_000_000
-    steps_per_photo: float = 60.0  # as often as a photograph is looked at
+    steps_per_photo: float = 60.0  # training steps on each photograph
     primitives_per_photo: float = 300.0
     photos_per_block: int = 200
-    uses: float = 2.5  # blocks that a photograph is used in
-    window: float = 0.6  # part of its pixels that is used in one
+    uses: float = 2.5  # number of blocks that use a photograph
+    window: float = 0.6  # share of its pixels that one of them uses
 
 
 @dataclass(frozen=True)
 class Fit:
-    """The numbers of this module's formula."""
+    """The coefficients of the formulas in this module's docstring."""
 
     setup: tuple[float, float, float]
     step: tuple[float, float, float]
@@ -69,20 +69,20 @@ class Fit:
     filling: tuple[float, float]
 
     def seconds_of_filling(self, photos: float) -> float:
-        """Processor seconds of filling up the points before the first task of a block; of no more than so many
-        views."""
+        """Return the processor seconds of filling up the points before the first task of a block; constant from
+        MOST_VIEWS views on."""
         return float(np.dot(self.filling, _filling_terms(photos)))
 
     def seconds_of_setup(self, photos: float, pixels: float) -> float:
-        """Processor seconds before the first step, without filling up points."""
+        """Return the processor seconds before the first step, without filling up points."""
         return float(np.dot(self.setup, _setup_terms(photos, pixels)))
 
     def seconds_of_step(self, pixels: float, primitives: float) -> float:
-        """Processor seconds of a step."""
+        """Return the processor seconds of a step."""
         return float(np.dot(self.step, (1.0, pixels, primitives)))
 
     def gib(self, photos: float, pixels: float, primitives: float) -> float:
-        """Memory at its peak."""
+        """Return the peak memory."""
         return float(np.dot(self.memory, (1.0, photos * pixels, pixels, primitives)))
 
 
@@ -97,8 +97,7 @@ def _filling_terms(photos: float) -> tuple[float, float]:
 
 
 def fit(rows: list[dict]) -> Fit:
-    """The fit through rows of `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib`,
-    `filling_seconds`."""
+    """Fit rows with `photos`, `pixels`, `primitives`, `setup_seconds`, `step_seconds`, `gib` and `filling_seconds`."""
     from scipy.optimize import nnls
 
     def solve(terms: list[tuple], wanted: list[float]) -> tuple[float, ...]:
@@ -119,7 +118,7 @@ def fit(rows: list[dict]) -> Fit:
 
 
 def check(found: Fit, row: dict) -> dict:
-    """What the fit says of a size that it has not seen, and the ratio to what was measured."""
+    """Return the fit's predictions for a size that was not fitted, with the measurements and their ratio."""
     said = {
         "setup_seconds": found.seconds_of_setup(row["photos"], row["pixels"]),
         "step_seconds": found.seconds_of_step(row["pixels"], row["primitives"]),
@@ -132,7 +131,7 @@ def check(found: Fit, row: dict) -> dict:
 
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
-    """Core-hours, memory of a worker, storage and network of a capture of so many photographs."""
+    """Return core-hours, memory of a worker, storage and network traffic for a capture of so many photographs."""
     from linprim_geo.training.blocks.driver import OVERLAP
     from linprim_geo.training.blocks.plan import (
         COARSE_DOWNSCALE,
@@ -147,14 +146,15 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     window, small = capture.window * capture.pixels, capture.pixels / COARSE_DOWNSCALE**2
     blocks = max(1, math.ceil(photos * capture.uses / capture.photos_per_block))
     primitives = photos * capture.primitives_per_photo
-    # A block and its margin stand before the coarse scene, and after an exchange before what others hold, too.
+    # A block and its margin are rendered with the coarse scene, and after an exchange also with other blocks'
+    # primitives.
     trained = OVERLAP * primitives / blocks
     held = trained + MOST_COARSE_PRIMITIVES
     joined = held + min(MOST_BESIDE, primitives)
     steps = capture.steps_per_photo * capture.photos_per_block
     alone, tasks = until(TrainOptions(), 0), 1 + len(EXCHANGES)
-    # Forward only is a third of a step: every task renders the coarse depth of its views, and what stands beyond where
-    # that is coarse.
+    # A forward pass alone takes a third of a step. For each of its views, every task renders the coarse depth at the
+    # reduced size, and the frozen primitives in the window.
     setup = found.seconds_of_setup(capture.photos_per_block, window) + capture.photos_per_block / 3 * (
         found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) + found.seconds_of_step(window, joined)
     )
@@ -165,12 +165,12 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
     views = min(photos, MOST_COARSE_VIEWS)
     coarse = found.seconds_of_setup(views, small) + found.seconds_of_filling(views)
     coarse += COARSE_STEPS * capture.steps_per_photo * views * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES)
-    # It looks at every view twice.
+    # Planning renders every view twice.
     planning = 2 * photos * found.seconds_of_step(small, MOST_COARSE_PRIMITIVES) / 3
     photo = BYTES_OF_PHOTO * capture.pixels
-    # 27 numbers of colour and 11 others, 4 bytes each: a task leaves two checkpoints, with both of Adam's moments, and
-    # what it trained in three files. It reads those checkpoints of others that hold what it takes up, about twice as
-    # much.
+    # A primitive has 27 numbers of colour and 11 others, 4 bytes each. A task leaves two checkpoints, with both of
+    # Adam's moments, and its result in three files. It reads the checkpoints of the blocks whose primitives it takes
+    # over, about twice as much.
     state = 4 * (11 + 27)
     saved = trained * (3 + 3) * state
     saves = steps / TrainOptions().checkpoint_every + tasks
@@ -189,7 +189,8 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
 
 
 def shown_in_blocks(run: Path) -> tuple[float, float]:
-    """(blocks that a photograph is used in, part of its pixels that is used in one) of a run in blocks."""
+    """Return (number of blocks that use a photograph, share of its pixels that one of them uses), for a run in
+    blocks."""
     from linprim_geo.runs.run import Run
     from linprim_geo.training.blocks.plan import read_plan
 
@@ -200,7 +201,7 @@ def shown_in_blocks(run: Path) -> tuple[float, float]:
 
 
 def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitives: int, steps: int) -> dict:
-    """Processor seconds of the setup and of a step of a training that has its photographs where a block has them."""
+    """Measure processor seconds of the setup and of a step of a training that stores photographs as a block does."""
     import torch
 
     from linprim_geo.capture.load import load_scene
@@ -231,7 +232,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
     setup = time.process_time() - begin - filling
     for _ in range(WARM_UP):
         trainer.advance()
-    trainer.step = TrainOptions.iterations // 2  # all degrees of the colour
+    trainer.step = TrainOptions.iterations // 2  # from here on colours have all degrees
     begin = time.process_time()
     for _ in range(steps):
         trainer.advance()
@@ -248,7 +249,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
 
 
 def table(fitted: Fit, checked: dict, predictions: list[dict], capture: Capture) -> str:
-    """The fit, its check, the predictions and what they assume, as Markdown."""
+    """Return the fit, its check, the predictions and their assumptions, as Markdown."""
     lines = [
         "| photographs | blocks | primitives | core-hours | longest task, h | GiB per worker | storage, GiB | "
         "network, GiB |",
@@ -289,7 +290,7 @@ def table(fitted: Fit, checked: dict, predictions: list[dict], capture: Capture)
 
 
 def run(given: argparse.Namespace) -> dict:
-    """Measures what is not measured yet, fits, predicts, and writes the table."""
+    """Run the missing measurements, fit, predict, and write the table."""
     from linprim_geo.base.progress import Progress
     from linprim_geo.eval.studies.street import street
     from linprim_geo.jobs.executor import Task

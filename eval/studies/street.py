@@ -1,5 +1,4 @@
-"""A street as long as one likes, for captures of any size: a hall of facades with doors, windows, carts, trees and
-boxes."""
+"""A street of any length, for captures of any size: a hall with facades, doors, windows, carts, trees and boxes."""
 
 from __future__ import annotations
 
@@ -25,8 +24,8 @@ PALETTE = (
 
 
 def street(houses: int, seed: int = 11) -> TexturedMesh:
-    """The air of a street of so many houses on either side: one closed surface whose faces look into it. In metres, x
-    along it, z up."""
+    """Return the air of a street with so many houses on either side: one closed surface, with faces towards the inside.
+    Units are metres; x is along the street, z up."""
     from manifold3d import Manifold
 
     tags, rng = Tags(), np.random.default_rng(seed)

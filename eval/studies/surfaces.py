@@ -44,13 +44,13 @@ from linprim_geo.geometry.mesh import Mesh
 
 BUILT_IN = ("cad", "smooth", "room", "wires")
 METHODS = {"octahedron": ("tsdf", "polyhedra", "opacity-field"), "gaussian": ("tsdf",)}
-# Stereo in training and extraction, and neither.
+# With stereo in training and extraction, and without.
 STEREO = ("auto", "off")
-# A capture without a mesh to compare with.
+# Marks a capture without a reference mesh.
 NO_REFERENCE = Path("none")
-# A depth of the mesh is right if it is off by no more, as a share of the depth image's.
+# Largest relative difference of the mesh from a depth image that counts as correct.
 RIGHT_DEPTH = 0.01
-# Points per surface: the standard error of a Chamfer distance is about 0.3 % of it.
+# Sample points per surface. The standard error of a Chamfer distance is then about 0.3 % of it.
 SAMPLES = 100_000
 COLUMNS = {
     "scene": "scene",
@@ -82,7 +82,7 @@ COLUMNS = {
 
 
 def score(run: Path, reference: Path, method: str, options: ExtractOptions, target: Path) -> dict:
-    """Extracts one mesh to `target` and returns its row; `reference` may be NO_REFERENCE."""
+    """Extract one mesh to `target` and return its row; `reference` may be NO_REFERENCE."""
     from linprim_geo.surface.extract import extract_mesh
 
     began = time.process_time()
@@ -104,7 +104,7 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
 
 
 def _photographs(run: Path, visible: Path) -> dict:
-    """What held-out photographs and the depth images of a capture say of a run and its mesh."""
+    """Score a run against held-out photographs, and its mesh against the depth images of the capture."""
     from linprim_geo.eval.images import eval_images_run
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.runs.run import Run
@@ -117,7 +117,8 @@ def _photographs(run: Path, visible: Path) -> dict:
 
 
 def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
-    """Share of the pixels with a depth image at which a mesh is within RIGHT_DEPTH of it, None without such images."""
+    """Return the share of the pixels of depth images at which a mesh is within RIGHT_DEPTH of the depth; None without
+    depth images."""
     from linprim_geo.geometry.raycast import RayCaster
 
     caster, right, known = RayCaster(mesh.vertices, mesh.faces), 0, 0
@@ -132,8 +133,8 @@ def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
 
 
 def score_true_depth(capture: Path, reference: Path, options: SceneOptions, target: Path) -> dict:
-    """Fuses exact depth maps of the training cameras as `extract-mesh --method tsdf` fuses rendered ones, to `target`,
-    and returns the row."""
+    """Fuse exact depth maps of the training cameras to `target`, as `extract-mesh --method tsdf` fuses rendered ones;
+    return the row."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
     from linprim_geo.geometry.raycast import RayCaster
@@ -158,7 +159,7 @@ def score_true_depth(capture: Path, reference: Path, options: SceneOptions, targ
 
 
 def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
-    """Scores of the mesh of a run, and of what is predicted of its part that cameras see, against the reference."""
+    """Score the mesh of a run against the reference, and the predicted errors of the part that cameras see."""
     from scipy.stats import spearmanr
 
     from linprim_geo.eval.surface_samples import SurfaceDistance
@@ -177,7 +178,7 @@ def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
 
 
 def _against(mesh: Mesh, truth: Mesh, cameras: Sequence[Camera]) -> dict:
-    """Scores of a mesh against the reference, of what the cameras see unless it says whole."""
+    """Score a mesh against the reference: the part that cameras see, except for scores of the whole mesh."""
     from linprim_geo.eval.mesh import score_mesh
 
     whole = score_mesh(mesh, truth, samples=SAMPLES, cameras=cameras)
@@ -198,7 +199,7 @@ def _against(mesh: Mesh, truth: Mesh, cameras: Sequence[Camera]) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    """Markdown."""
+    """Return a Markdown table."""
     lines = ["| " + " | ".join(COLUMNS.values()) + " |", "|---" * len(COLUMNS) + "|"]
     for row in rows:
         cells = [
@@ -210,7 +211,7 @@ def table(rows: list[dict]) -> str:
 
 
 def _saved(target: Path, measure: Callable[[], dict]) -> dict:
-    """The row of a mesh, measured unless it lies beside it already."""
+    """Return the row of a mesh: the one saved beside it, or else a new measurement."""
     saved = target.with_suffix(".json")
     if not saved.exists():
         write_json(saved, measure())
@@ -220,7 +221,7 @@ def _saved(target: Path, measure: Callable[[], dict]) -> dict:
 
 
 def rounds(text: str) -> int | str:
-    """An argument of --refine."""
+    """Parse an argument of --refine."""
     return text if text == "auto" else int(text)
 
 
@@ -272,7 +273,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Everything that the command does."""
+    """Run the whole command."""
     from linprim_geo.synthetic.synth import synthesize
     from linprim_geo.training.train import train
 

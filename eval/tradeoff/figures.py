@@ -32,8 +32,7 @@ DARK = {
     "dim": "#8f99a5",
 }
 STYLE = f"@media (prefers-color-scheme: dark) {{ svg {{ {' '.join(f'--{k}: {v};' for k, v in DARK.items())} }} }}"
-# What a value is called where several parameters are in one plot; parameters that are not here keep the names of their
-# values.
+# Display names of values in a plot of several parameters. Values of other parameters keep their own names.
 NAMES = {
     "rays": "{} rays",
     "order": "{} order",
@@ -47,8 +46,8 @@ TWICE = re.compile(r"^2 of the ")
 
 
 def plotted_values(rows: Sequence[dict], parameters: Sequence[str], error: str) -> list[dict]:
-    """The measured values of some parameters for one plot: named, the shared default once, and the frontier of all of
-    them anew."""
+    """Return the measured values of some parameters for one plot: with display names, the shared default only once, and
+    a new frontier of all of them."""
     found, default = [], None
     for row in rows:
         if row["parameter"] not in parameters or row.get(error) is None or row["seconds"] <= 0:
@@ -64,10 +63,10 @@ def plotted_values(rows: Sequence[dict], parameters: Sequence[str], error: str) 
 
 
 def figures(sweep: Path, output: Path) -> list[Path]:
-    """Writes both files from the `tradeoff.json` in the folder `sweep` into `output`; returns their paths.
+    """Write both files from the `tradeoff.json` in the folder `sweep` into `output`; return their paths.
 
     Raises:
-        LinprimError: it cannot be read, or lacks a parameter or an error of a panel, as without a reference mesh.
+        LinprimError: it cannot be read, or lacks a parameter or an error of a plot, as without a reference mesh.
     """
     file = sweep / "tradeoff.json"
     results = read_json(file, "what linprim-geo tradeoff has written")

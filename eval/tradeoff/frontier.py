@@ -1,5 +1,5 @@
-"""What a sweep of a parameter says: the settings that no other beats in both time and error, and whether the more
-expensive ones are worth it."""
+"""Evaluates the sweep of a parameter: the Pareto frontier of time and error, and whether more expensive settings are
+worth it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 from linprim_geo.eval.tradeoff.parameters import ERRORS, Parameter
 
-# The rule of the verdict. A more expensive value is worth its time if error ~ time^-r with r at least this: what
-# averaging independent samples gives, which is always there as another way to spend time. Less error than this share is
-# none.
+# A more expensive value is worth its time if error ~ time^-r with r at least RETURN. Averaging independent samples
+# gives 0.5, and is always another way to spend time. A reduction of the error by less than LEAST_GAIN, a share, does
+# not count.
 RETURN, LEAST_GAIN = 0.5, 0.01
 RULE = (
     "A more expensive value is worth it if it divides the error by at least the root of what it multiplies the time "
@@ -20,8 +20,8 @@ RULE = (
 
 
 def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the (seconds, error) that no other beats in both, from the fastest on; of equal ones the first. NaN is
-    beaten."""
+    """Return the indices of the (seconds, error) that no other is below in both, from the fastest on; the first of
+    equal ones. Points with NaN are left out."""
     order = sorted((p for p in range(len(points)) if all(map(math.isfinite, points[p]))), key=lambda p: (*points[p], p))
     kept: list[int] = []
     for k in order:
@@ -31,7 +31,7 @@ def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def pays(cheap: dict, expensive: dict, error: str) -> bool:
-    """Whether the step from one row to a more expensive one follows RULE."""
+    """Return whether the step from one row to a more expensive one is worth it by RULE."""
     a, b = cheap[error], expensive[error]
     if not b < (1 - LEAST_GAIN) * a:
         return False
@@ -40,18 +40,17 @@ def pays(cheap: dict, expensive: dict, error: str) -> bool:
 
 
 def same_time(one: dict, other: dict) -> bool:
-    """Whether the middle halves of two timings overlap; single timings do not count as equal."""
+    """Return whether the interquartile ranges of two timings overlap; single timings never count as equal."""
     if min(one["rounds"], other["rounds"]) < 2:
         return False
     return one["low"] <= other["high"] and other["low"] <= one["high"]
 
 
 def verdict(parameter: Parameter, rows: Sequence[dict]) -> dict:
-    """The sentence about a parameter from its rows, and `error`, `cheapest`, `taken`, `most_accurate` (names of
-    values).
+    """Return the sentence about a parameter, and `error`, `cheapest`, `taken`, `most_accurate` (names of values).
 
-    A row has `value`, `seconds`, `low`, `high`, `rounds`, and the errors; the first of the parameter's errors that all
-    rows have decides.
+    A row has `value`, `seconds`, `low`, `high`, `rounds`, and the errors. The decision uses the first of the
+    parameter's errors that all rows have.
     """
     rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
     measured = [

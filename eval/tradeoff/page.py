@@ -1,5 +1,5 @@
-"""The page of a sweep: one HTML file with a plot and a table per parameter; well-formed XML, no script, nothing from
-elsewhere."""
+"""The report of a sweep: one HTML file with a plot and a table per parameter. It is well-formed XML, without scripts or
+external resources."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ p.verdict { font-weight: 600; } .small { color: #59636e; font-size: 0.86em; }
 
 
 def page(results: dict, parameters: dict[str, Parameter]) -> str:
-    """The HTML of what tradeoff.json holds."""
+    """Return the HTML for the content of tradeoff.json."""
     about = results["about"]
     parts = [
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/><title>What accuracy costs in time</title>',
@@ -52,7 +52,7 @@ def page(results: dict, parameters: dict[str, Parameter]) -> str:
 
 
 def table(rows: Sequence[dict], parameter: Parameter) -> str:
-    """The rows of one parameter."""
+    """Return the HTML table of one parameter's rows."""
     errors = [name for name in parameter.errors if any(row.get(name) is not None for row in rows)]
     gradient = any(row.get("gradient_seconds") is not None for row in rows)
     head = ["value", "seconds", "quartiles", *(["with gradient"] if gradient else []), "peak GiB"]
@@ -72,7 +72,7 @@ def table(rows: Sequence[dict], parameter: Parameter) -> str:
 
 
 def panel(rows: Sequence[dict], error: str, title: str = "") -> Panel:
-    """The measured settings of `rows` as points of error over seconds."""
+    """Return the measured settings in `rows` as a plot of error over seconds."""
     what = ERRORS[error]
     points = [
         Point(row["value"], row["seconds"], row["low"], row["high"], row[error], row["frontier"], row["default"])

@@ -1,10 +1,9 @@
-"""Every parameter that trades time for accuracy: its values from cheap to expensive, how a value is set, and the error
-that it is judged by.
+"""The parameters that trade time for accuracy: their values from cheap to expensive, and the errors that judge them.
 
-What a value sets is a table of changes to the defaults; `sweep.py` sweeps one parameter at a time. Of the four
-groups, `render` changes keywords of `ops.rasterize` (and the scalar and the degree of its tensors) on a trained run,
-`train` changes options or the photographs of a training, `extract` the method and the voxel size, `evaluate` the points
-of a score.
+A value is a dict of changes to the defaults; `sweep.py` varies one parameter at a time. There are four groups. `render`
+changes keywords of `ops.rasterize` (and the scalar and the degree of its tensors) on a trained run, `train` options or
+the photographs of a training, `extract` the method and the voxel size, `evaluate` the number of sample points of a
+score.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ GROUPS = ("render", "train", "extract", "evaluate")
 
 @dataclass(frozen=True)
 class Value:
-    """One setting of a parameter: its `name` as shown, and what it changes of the defaults (nothing for the default
-    itself)."""
+    """One setting of a parameter: its display `name`, and its changes to the defaults (none for the default itself)."""
 
     name: str
     changes: dict = field(default_factory=dict)
@@ -28,8 +26,8 @@ class Value:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter. `errors` are keys of `ERRORS`: the first that a scene allows decides, the others are reported beside
-    it."""
+    """A parameter. `errors` are keys of `ERRORS`: the first one that a scene allows decides, the others are reported
+    too."""
 
     name: str
     title: str
@@ -41,7 +39,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Error:
-    """A measure of what is lost: how it is called, its unit, and whether it falls to 0 for a perfect result."""
+    """An error measure with its title and unit."""
 
     title: str
     unit: str = ""
@@ -58,11 +56,11 @@ ERRORS = {
     "boundary_edges": Error("boundary edges"),
     "standard_error_percent": Error("standard error of the score", "% of the diagonal"),
 }
-# What rendering is without any changes: `train`'s defaults; a run of a lower degree has no values above it. The
-# reference is the integral itself, in double precision, of all degrees that the run has.
+# Rendering without changes: the defaults of `train`; a run of a lower degree has no values above it. The reference is
+# the exact volume rendering integral, in double precision, with all degrees of the run.
 RENDER_DEFAULTS = {"ray_model": "exact", "order": "center", "scalar": "float32", "stop": 1e-3, "degree": 2}
 RENDER_REFERENCE = {"ray_model": "exact", "order": "overlap", "scalar": "float64", "stop": 0.0, "degree": 3}
-# Extraction without changes: the voxel that the views support, times 1.
+# Extraction without changes: the voxel size supported by the views, times 1.
 EXTRACT_DEFAULTS = {"method": "tsdf", "voxel": 1.0}
 EVALUATE_DEFAULTS = {"samples": 200_000}
 
@@ -71,7 +69,7 @@ TRAIN_ERRORS = ("chamfer_percent", "depth_percent", "photo_percent")
 
 
 def _values(key: str, values: dict) -> tuple[Value, ...]:
-    """A value for each name, that sets `key` to its value."""
+    """Return a value for each name, which sets `key`."""
     return tuple(Value(name, {key: value}) for name, value in values.items())
 
 
@@ -194,14 +192,16 @@ PARAMETERS = {
 
 
 def value_named(parameter: Parameter, name: str) -> Value:
-    """The value of that name."""
+    """Return the value of that name."""
     return next(value for value in parameter.values if value.name == name)
 
 
 def settings(parameter: Parameter, value: Value) -> dict:
-    """What is measured for a value: the defaults of the parameter's group with its changes, so that a setting that
-    several parameters have in common is measured once. Of training only what differs from the base, and nothing for a
-    value that is the base."""
+    """Return the setting that is measured for a value: the defaults of the parameter's group with its changes.
+
+    A setting that several parameters share is thus measured once. In the group `train` it holds only the differences
+    from the base, and is empty for the base itself.
+    """
     base = {"render": RENDER_DEFAULTS, "extract": EXTRACT_DEFAULTS, "evaluate": EVALUATE_DEFAULTS, "train": {}}[
         parameter.group
     ]
@@ -213,11 +213,11 @@ def settings(parameter: Parameter, value: Value) -> dict:
 def training_options(
     options: TrainOptions, scene: SceneOptions, views: int, changes: dict
 ) -> tuple[TrainOptions, SceneOptions]:
-    """The base's options with the changes of a value of the group `train`; `views` is the number of training views of
-    the scene.
+    """Return the base's options with the changes of a value of the group `train`; `views` is the scene's number of
+    training views.
 
-    `*_times` multiply the base's value, `views` is a share, `equal_time` is the sweep's business; everything else is an
-    option.
+    `*_times` multiply the base's value, `views` is a share, `equal_time` is applied by the sweep; all other changes are
+    options.
     """
     at_once = {}
     for name, value in changes.items():
@@ -233,15 +233,15 @@ def training_options(
 
 
 def setting_key(group: str, setting: dict) -> str:
-    """Under which a setting is kept in measured.json."""
+    """Return the key of a setting in measured.json."""
     return f"{group} {json.dumps(setting, sort_keys=True)}"
 
 
 def describe_setting(setting: dict) -> str:
-    """For people."""
+    """Return a readable text for a setting."""
     return ", ".join(f"{name} {value}" for name, value in setting.items()) or "defaults"
 
 
 def setting_name(setting: dict) -> str:
-    """Of a file or folder."""
+    """Return the name of a setting's file or folder."""
     return "_".join(f"{name}-{value}" for name, value in setting.items()) or "base"

@@ -1,5 +1,5 @@
-"""A run drawn under the settings of the parameters of rendering: how long that takes, and how far it is from the
-integral itself."""
+"""Rendering of a run with the settings of a sweep: its time, and its error against the exact volume rendering
+integral."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.eval.tradeoff.parameters import RENDER_DEFAULTS, RENDER_REFERENCE
 from linprim_geo.runs.run import Run
 
-# A view is drawn so many times in a round, and the shortest counts.
+# Number of renders of a view per round, of which the fastest counts.
 REPEATS = 3
-# A view is rotated by this many pixels at its middle to see what pops.
+# Rotation of a view, in pixels at its centre, for measuring popping.
 POP_PX = 0.5
 
 
 class RenderedRun:
-    """A run, and the cameras of at most so many views, held-out ones if there are any, in the training frame."""
+    """A run with the cameras, in the training frame, of up to `most` views: held-out ones, or else training views."""
 
     def __init__(self, run: Run, most: int):
         self.run, self.primitives = run, run.training_primitives()
-        # The defaults with the degree of the run's colour.
+        # The defaults, with the degree of the run.
         self.defaults = RENDER_DEFAULTS | {"degree": math.isqrt(self.primitives.sh.shape[1]) - 1}
         scene = run.scene()
         views = scene.test or scene.train
         self.cameras = [view.camera.transformed(run.similarity) for view in views[:: -(-len(views) // most)]]
 
     def draw(self, setting: dict, camera, geometry: bool = False, gradients: bool = False):
-        """The run seen by a camera under a setting, and the seconds that took; with `gradients` the tensors' as well,
-        of the mean of the colour."""
+        """Render the run with a setting; return the result and the seconds. With `gradients` the time includes the
+        gradients of the mean colour with respect to the tensors."""
         import torch
 
         from linprim_geo.base.options import raster_options
@@ -59,7 +59,7 @@ class RenderedRun:
 
     @cached_property
     def truth(self) -> list:
-        """Per camera the integral itself: (colour, depth, colour after the small rotation)."""
+        """For each camera the exact integral: (colour, depth, colour after the small rotation)."""
         import torch
 
         exact = RENDER_REFERENCE | {"degree": self.defaults["degree"]}
@@ -74,7 +74,7 @@ class RenderedRun:
         return found
 
     def seconds(self, setting: dict) -> tuple[float, float]:
-        """Of a frame, and of one with its gradient: means over cameras of the shortest of REPEATS."""
+        """Return the seconds of a frame, and of one with its gradient: means over cameras of the fastest of REPEATS."""
         import torch
 
         with torch.no_grad():
@@ -85,7 +85,8 @@ class RenderedRun:
         return float(np.mean(frame)), float(np.mean(with_gradient))
 
     def errors(self, setting: dict, wanted: set) -> dict[str, float]:
-        """Means over cameras of the errors of parameters.ERRORS that are wanted, image and depth in any case."""
+        """Return means over cameras of the `wanted` errors of parameters.ERRORS, and always those of image and
+        depth."""
         import torch
 
         truth = self.truth
@@ -113,7 +114,7 @@ class RenderedRun:
 
 
 def rotated(camera):
-    """The camera turned about its own upright axis by POP_PX pixels at the middle of its image."""
+    """Return the camera rotated about its vertical axis by POP_PX pixels at the centre of its image."""
     angle = POP_PX / camera.fx
     turn = np.eye(4)
     turn[0, 0] = turn[2, 2] = math.cos(angle)

@@ -1,5 +1,4 @@
-"""What a sweep has measured as rows, with a verdict for each parameter: `tradeoff.csv`, `tradeoff.json` and
-`tradeoff.html`."""
+"""Reports a sweep as rows with a verdict for each parameter: `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`."""
 
 from __future__ import annotations
 
@@ -37,11 +36,11 @@ COLUMNS = (
 def write_report(
     folder: Path, about: dict, parameters: Sequence[Parameter], measured: Mapping[str, Sequence[tuple[Value, dict]]]
 ) -> dict:
-    """Writes the three files into `folder` and returns what the JSON holds.
+    """Write the three files to `folder` and return the content of the JSON.
 
     Args:
-        about: what was swept, and how.
-        measured: by the parameter's name its values and what `tradeoff.Sweep` has stored of each.
+        about: the scene and the options of the sweep.
+        measured: by the parameter's name, its values with the entries that `tradeoff.Sweep` has stored for them.
     """
     rows, verdicts = [], {}
     for parameter in parameters:
@@ -73,7 +72,7 @@ def write_report(
 
 
 def describe(results: dict) -> str:
-    """What `write_report` returns as lines for a person: a sentence per parameter, the rule, and the files."""
+    """Return the result of `write_report` as readable lines: a sentence per parameter, the rule, and the files."""
     return "\n".join([*results["sentences"].values(), "", results["rule"], "", *results["files"]])
 
 

@@ -1,4 +1,4 @@
-"""What a sweep has measured so far, in one file, so that it can be interrupted: an entry per setting."""
+"""Stores the measurements of a sweep in one file, an entry per setting, so that it can be interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from linprim_geo.base.files import write_json
 
 
 class Store:
-    """`measured.json` in `folder`. `about` says what is measured: a sweep of something else is refused. An entry holds
-    its `setting`, the `times` of each round in seconds, `peak_gib`, `errors` that were found once, and, where measuring
-    it `failed`, why.
+    """`measured.json` in `folder`. `about` describes the sweep; measurements of a different one are rejected. An entry
+    holds its `setting`, the `times` of each round in seconds, `peak_gib`, the `errors`, which are computed once, and
+    the reason if measuring `failed`.
 
     Raises:
-        LinprimError: the folder holds another sweep, or something else.
+        LinprimError: the folder holds another sweep, or other files.
     """
 
     def __init__(self, folder: Path, about: dict):
@@ -37,20 +37,20 @@ class Store:
         return self.entries[key]
 
     def get(self, key: str) -> dict:
-        """The entry, or an empty one that is not kept."""
+        """Return the entry, or an empty one, which is not stored."""
         return self.entries.get(key, {})
 
     def entry(self, key: str, setting: dict) -> dict:
-        """The entry, made if it is not there."""
+        """Return the entry; create it if it does not exist."""
         return self.entries.setdefault(key, {"setting": setting, "times": [], "peak_gib": 0.0, "errors": {}})
 
     def note(self, key: str, seconds: float, peak_gib: float = 0.0, **more) -> None:
-        """One more time, and whatever else was found with it."""
+        """Add a time, and update further fields."""
         entry = self.entries[key]
         entry["times"].append(seconds)
         entry["peak_gib"] = max(entry["peak_gib"], peak_gib)
         entry.update(more)
 
     def save(self) -> None:
-        """Writes the file."""
+        """Write the file."""
         write_json(self.path, {"about": self.about, "measured": self.entries})

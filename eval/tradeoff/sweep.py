@@ -1,9 +1,8 @@
-"""What accuracy costs in time on a scene: every parameter of `parameters.py` swept one at a time around the
-defaults.
+"""Measures what accuracy costs in time on a scene: sweeps each parameter of `parameters.py` around the defaults.
 
 Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after
-round, so that a noisy machine hurts all alike; a timing is the median of the rounds with its quartiles. What was
-measured is kept in `measured.json` of the folder, and taken from there.
+round, so that other load on the machine affects all alike. A timing is the median of the rounds with its quartiles.
+Measurements are kept in `measured.json` of the folder, and reused.
 """
 
 from __future__ import annotations
@@ -45,13 +44,13 @@ from linprim_geo.runs.run import Run
 from linprim_geo.training.budget.memory import memory_estimate
 from linprim_geo.training.step.training_images import photo_bytes
 
-# The training that parameters are swept around: a modest size of the defaults, images averaged down to at most so many
-# pixels across.
+# The training around which parameters are varied: the defaults at a modest size, with images downscaled to at most
+# WIDEST pixels in width.
 MODEST = {"iterations": 2000, "max_primitives": 2000}
 QUICK = {"iterations": 200, "max_primitives": 200}
 WIDEST, QUICK_WIDEST = 400, 128
 ROUNDS, QUICK_ROUNDS = 3, 2
-# Held-out views that render parameters are measured on.
+# Number of held-out views for measuring render parameters.
 RENDERED_VIEWS, QUICK_VIEWS = 8, 2
 
 
@@ -65,21 +64,22 @@ def tradeoff(
     quiet: bool = False,
     **changes: Any,
 ) -> dict:
-    """Sweeps the parameters on a scene and writes the tables and the page into the folder `output`.
+    """Sweep the parameters on a scene and write the tables and the HTML report to the folder `output`.
 
     Args:
-        options: what is measured. `run` is not changed; without it one is trained with the defaults at the size
-            `MODEST`, or with `quick` at `QUICK`, which is also what training parameters are swept around. `reference`
-            is for Chamfer distances and depth.
-        cluster, workers: where and how many trainings at once, see `jobs.open.open_executor`; they share the cores of a
-            machine, and are timed so. Neither: here, one after another. Everything else is measured here in any case.
+        options: the settings of the sweep. `run` is not modified; without it, one is trained with the defaults at the
+            size `MODEST`, or with `quick` at `QUICK`, around which training parameters are varied in any case.
+            `reference` is used for Chamfer distances and depth.
+        cluster, workers: where trainings run and how many at once, see `jobs.open.open_executor`; they share the cores
+            of a machine, and are timed so. With neither, trainings run in this process, one after another. All other
+            measurements are made in this process.
         changes: fields of `options` by name, such as `quick=True`.
 
-    Returns: what tradeoff.json holds: `rows` (one per value of each parameter), `sentences`, `rule`, `about`,
+    Returns: the content of tradeoff.json: `rows` (one per value of each parameter), `sentences`, `rule`, `about`,
         `files`.
 
     Raises:
-        LinprimError: a parameter has another name, the scene or the run cannot be used, or the folder holds another
+        LinprimError: a parameter is unknown, the scene or the run cannot be used, or the folder holds another
         sweep.
     """
     options = with_changes(TradeoffOptions, options, changes)
@@ -100,8 +100,8 @@ def tradeoff(
 
 
 class Sweep:
-    """One folder of measurements. With an `executor` trainings are its tasks, on so many `cores` each, and count as
-    `slot` of its own."""
+    """One folder of measurements. With an `executor`, trainings are its tasks, with `cores` threads each, and each
+    occupies `slot` of the executor's cores."""
 
     executor: Executor | None = None
     cores = slot = 1
@@ -117,7 +117,7 @@ class Sweep:
         size = (QUICK if quick else MODEST) | {name: value for name, value in given.items() if value is not None}
         self.rounds = options.rounds or (QUICK_ROUNDS if quick else ROUNDS)
         self.progress = Progress("tradeoff", 1, quiet=quiet)
-        # The first time of all loads libraries, and is not counted.
+        # The first run of each kind loads libraries, and is not timed.
         self.warm = self.warm_score = self.warm_train = False
         prepare(scene, threads=threads, log=self.progress.note)
         self.scene = load_scene(scene, downscale=1)
@@ -140,7 +140,7 @@ class Sweep:
     # --- what is measured -------------------------------------------------------------------------------
 
     def measure(self, parameters: Sequence[Parameter]) -> dict:
-        """Measures what is missing, and writes the results."""
+        """Run the missing measurements, and write the results."""
         import torch
 
         from linprim_geo.kernels import ops
@@ -169,7 +169,7 @@ class Sweep:
         return self._report(parameters)
 
     def _fitting(self, parameter: Parameter) -> Parameter:
-        """The parameter without the values that the run, or this installation, does not have."""
+        """Return the parameter without values that the run, or this installation, does not support."""
         from linprim_geo.surface.extract import METHODS
 
         values = parameter.values
@@ -195,7 +195,7 @@ class Sweep:
     def _in_turn(
         self, group: str, parameters: Sequence[Parameter], measure: Callable[[str, dict, set, int], None]
     ) -> None:
-        """Every setting of a group once per round, unless it was measured in that round before."""
+        """Measure every setting of a group once per round, unless that round was measured before."""
         wanted: dict[str, tuple[dict, set]] = {}
         for parameter in parameters:
             for value in parameter.values:
@@ -220,12 +220,12 @@ class Sweep:
                     self.progress.note(f"  {error}")
                 self.store.save()
 
-    # --- the run that is looked at ----------------------------------------------------------------------
+    # --- the run that is measured -----------------------------------------------------------------------
 
     @cached_property
     def base(self) -> Path:
-        """Folder of the run that render, extraction and evaluation parameters are measured on: a copy of the given one,
-        or the trained base."""
+        """The folder of the run on which render, extraction and evaluation parameters are measured: a copy of the given
+        run, or the trained base."""
         if self.given is None:
             key = setting_key("train", {})
             if not self.store.get(key).get("errors"):
@@ -233,7 +233,7 @@ class Sweep:
                 self.progress.note("training with the defaults")
                 self._train(key, {}, set(PARAMETERS["primitive"].errors), 0)
                 if self.executor:
-                    self.store[key]["times"].clear()  # it was alone; the others share the cores
+                    self.store[key]["times"].clear()  # it ran alone, while the others share the cores
                 self.store.save()
             return self.folder / "runs" / setting_name({})
         return copy_run(Path(self.given), self.folder / "runs" / "given")
@@ -265,7 +265,7 @@ class Sweep:
     # --- train ------------------------------------------------------------------------------------------
 
     def _options(self, key: str, setting: dict) -> tuple[TrainOptions, SceneOptions]:
-        """Those of a training, chosen once."""
+        """Return the options of a training, which are determined once."""
         entry = self.store[key]
         if "options" not in entry:
             options, scene_options = training_options(self.options, self.scene_options, len(self.scene.train), setting)
@@ -275,8 +275,8 @@ class Sweep:
         return TrainOptions(**entry["options"][0]), SceneOptions(**entry["options"][1])
 
     def _train_at_once(self, settings: Sequence[dict], turn: int) -> None:
-        """The trainings of a round that are not measured yet, by the executor. Raises LinprimError for what ends them
-        all."""
+        """Run the missing trainings of a round on the executor. Raises LinprimError for an error that ends all of
+        them."""
         assert self.executor is not None
         tasks = {}
         folder = self.folder / "runs" / f"round_{turn}_{self.cores}"
@@ -345,7 +345,7 @@ class Sweep:
             entry["errors"] = self._train_errors(self.folder / "runs" / setting_name(setting))
 
     def _equal_time(self, setting: dict, iterations: int) -> int:
-        """Steps that take as long as the base's, by the timings of both at equal count."""
+        """Return the number of steps that take as long as the base's, from the timings of both at equal steps."""
         count = {name: value for name, value in setting.items() if name != "equal_time"}
         both = [setting_key("train", {}), setting_key("train", count)]
         for key, of in zip(both, ({}, count), strict=True):
@@ -368,7 +368,7 @@ class Sweep:
 
     @cached_property
     def supported_voxel(self) -> float:
-        """The voxel size that the run's views support."""
+        """The voxel size supported by the run's views."""
         from linprim_geo.surface.fusion.tsdf_fusion import auto_voxel_size
         from linprim_geo.surface.methods.method_tsdf import DepthFrames
 
@@ -412,7 +412,7 @@ class Sweep:
 
     @cached_property
     def scored_mesh(self):
-        """The surface of the run by the defaults."""
+        """The surface of the run, extracted with the defaults."""
         from linprim_geo.geometry.mesh_files import load_mesh
         from linprim_geo.surface.extract import extract_mesh
 

@@ -1,4 +1,4 @@
-"""The runs of a sweep: one training as a task, a copy of a given run, and what a run is worth: held-out images, depth,
+"""The runs of a sweep: a training as a task, a copy of a given run, and the errors of a run: held-out images, depth,
 surface."""
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.capture.types import View
 from linprim_geo.runs.run import Run
 
-# Points of a score that is not the parameter itself.
+# Sample points of scores, except where their number is the swept parameter.
 POINTS = 30_000
 
 
 class SurfaceScores:
-    """Scores of surfaces against a `reference` file, of the parts of both that training views see."""
+    """Scores of surfaces against a `reference` file, over the parts of both that training views see."""
 
     def __init__(self, views: Sequence[View], reference: Path | None):
         self.views, self.reference = views, reference
@@ -38,7 +38,7 @@ class SurfaceScores:
 
 
 def training_errors(run: Run, scores: SurfaceScores, note: Callable[[str], None]) -> dict:
-    """Held-out images and depth at the run's scale, and the surface, of a trained run."""
+    """Return the errors of a trained run: held-out images and depth at the run's scale, and the surface."""
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
     from linprim_geo.geometry.mesh_files import load_mesh
@@ -62,7 +62,8 @@ def training_errors(run: Run, scores: SurfaceScores, note: Callable[[str], None]
 
 
 def copy_run(given: Path, folder: Path) -> Path:
-    """`folder`, with a copy of what rendering and meshing need of a run. LinprimError if some of it is missing."""
+    """Copy the files of a run that rendering and meshing need to `folder`, and return it. LinprimError if one is
+    missing."""
     Run.open(given)
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("config.json", "transform.json", "run.json", "training_frame.npz"):
@@ -75,8 +76,8 @@ def copy_run(given: Path, folder: Path) -> Path:
 
 
 def train_task(folder: Path, scene: str, scene_options: dict, options: dict) -> dict:
-    """A training into folder/run, after a few steps that load the libraries. Returns its seconds and primitives, or why
-    it `failed`."""
+    """Train into folder/run, after a few steps that load the libraries. Return its seconds and primitives, or the
+    reason why it `failed`."""
     from linprim_geo.training.train import train
 
     chosen = SceneOptions(**scene_options), TrainOptions(**options)
