@@ -1,4 +1,4 @@
-"""The built-in scenes by name."""
+"""The built-in scenes, by name."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHAPES: dict[str, Callable[..., TexturedMesh]] = {
     "wires": wire_and_sheet,
     "hall": hall,
 }
-"""Each takes `detail`, the contrast of its fine texture."""
+"""The functions that make them. Each takes `detail`, the contrast of the fine texture."""
 
 TEXTURES = {"strong": 1.0, "weak": 0.1, "plain": 0.0}
-"""What `detail` is multiplied by, by name."""
+"""Factors on `detail`, by name."""

@@ -1,8 +1,8 @@
-"""What a camera does to the light before it is a photograph: blur, vignetting, exposure, noise, white balance, tone.
+"""Camera effects between the light and the photograph: blur, vignetting, exposure, noise, white balance, tone.
 
-The effects are applied in the order in which light meets them, on linear intensities, 1 being white: motion blur during
-the exposure, light lost towards the corners, the length of the exposure, photons and electronics, one colour per pixel,
-white balance, the tone curve. Rounding to 8 bits and JPEG come after that (`photos`).
+They are applied to linear intensities, 1 being white, in the order in which they occur: motion blur, vignetting,
+exposure, shot and read noise, the colour mosaic, white balance, the tone curve. Rounding to 8 bits and JPEG compression
+follow in `photos`.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from linprim_geo.base.srgb import to_linear, to_srgb
 from linprim_geo.synthetic.options import SynthOptions
 
 SEED = 9
-"""Tells the random numbers of these effects from those of other parts of a capture."""
+"""Separates the random numbers of these effects from those of other parts of a capture."""
 
 WALK_VIEWS = 12.0
-"""Exposure and white balance go up and down about once in so many views."""
+"""Approximate period of the drift of exposure and white balance, in views."""
 
 BLUR_STEPS_PER_PX = 4
-"""Positions of the image that are averaged for a pixel of motion."""
+"""Number of shifted images that are averaged per pixel of motion."""
 
 PHONE: dict[str, Any] = {
     "full_well": 6000.0,
@@ -37,11 +37,11 @@ PHONE: dict[str, Any] = {
     "focal_error": 0.003,
     "points_from": "photographs",
 }
-"""All effects at once, as of a phone in hand, indoors, with poses from structure from motion."""
+"""All effects together, as of a hand-held phone indoors with poses from structure from motion."""
 
 
 def with_camera(options: SynthOptions) -> SynthOptions:
-    """The options with the effects of their camera filled in where nothing was said; `ideal` fills in none."""
+    """Return the options with unset effects taken from their camera; `ideal` sets none."""
     if options.camera == "ideal":
         return options
     default = {entry.name: entry.default for entry in fields(SynthOptions)}
@@ -49,27 +49,27 @@ def with_camera(options: SynthOptions) -> SynthOptions:
 
 
 class CameraEffects:
-    """The effects of one capture, drawn by its seed; all that is off costs nothing and changes nothing."""
+    """The effects of one capture, drawn from its seed. Effects that are off cost nothing and change nothing."""
 
     def __init__(self, options: SynthOptions):
         self.options = options
         rng = np.random.default_rng([options.seed, SEED])
         self.stops = options.exposure_walk * _walk(options.views, rng)
-        """(views,) exposure of the training photographs, in stops from their mean."""
+        """(views,) exposure of the training photographs, in stops relative to their mean."""
         self.balance = options.white_balance * _walk(options.views, rng)
-        """(views,) red is 1 + this, blue 1 - this, green 1."""
+        """(views,) white balance b of the training photographs: gains of 1 + b for red, 1 for green, 1 - b for blue."""
 
     @property
     def on(self) -> bool:
-        """Whether any effect is."""
+        """Whether any effect is on."""
         o = self.options
         drifts = o.exposure_walk or o.white_balance
         return bool(o.full_well or drifts or o.vignetting or o.tone or o.motion_blur or o.mosaic != "none")
 
     def apply(self, color: np.ndarray, split: str, number: int) -> np.ndarray:
-        """sRGB (H, W, 3) of the light as sRGB (H, W, 3) of the photograph `number` of `train` or `test`.
+        """Return sRGB (H, W, 3) of photograph `number` of `train` or `test`, given sRGB (H, W, 3) of the light.
 
-        Held-out photographs have the mean exposure and white balance, so that they can be compared with renderings.
+        Held-out photographs have the mean exposure and white balance, so that they are comparable with renders.
         """
         if not self.on:
             return color
@@ -89,15 +89,15 @@ class CameraEffects:
         return toned(to_srgb(np.clip(light, 0.0, 1.0)), self.options.tone).astype(np.float32)
 
     def described(self) -> dict:
-        """What was drawn, for `synth.json`."""
+        """Return the drawn exposures and white balances, for `synth.json`."""
         stops = self.stops.tolist() if self.options.exposure_walk else []
         return {"stops": stops, "balance": self.balance.tolist() if self.options.white_balance else []}
 
 
 def motion_blurred(light: np.ndarray, length: float, rng: np.random.Generator) -> np.ndarray:
-    """The mean of the image along a straight line: a camera that turns at constant speed during the exposure.
+    """Return the mean of images shifted along a line, as of a camera that turns at constant speed during the exposure.
 
-    The line is up to 2 `length` pixels long, uniformly distributed, so `length` on average, in any direction.
+    The length of the line is uniform up to 2 `length` pixels, so `length` in the mean; its direction is random.
     """
     from scipy.ndimage import shift
 
@@ -111,17 +111,17 @@ def motion_blurred(light: np.ndarray, length: float, rng: np.random.Generator) -
 
 
 def vignette(height: int, width: int, loss: float) -> np.ndarray:
-    """(H, W) share of the light that arrives, 1 - loss r^2 with r = 1 in the corners."""
+    """Return the (H, W) share of the light that is not lost, 1 - loss r^2 with r = 1 in the corners."""
     y, x = np.mgrid[:height, :width] + 0.5
     squared = (x - 0.5 * width) ** 2 + (y - 0.5 * height) ** 2
     return 1.0 - loss * squared / (0.25 * (width**2 + height**2))
 
 
 def exposed(light: np.ndarray, full_well: float, read_noise: float, rng: np.random.Generator) -> np.ndarray:
-    """Intensities as a sensor counts them: at white a pixel holds `full_well` electrons; 0 is a perfect sensor.
+    """Return intensities with sensor noise. At white, a pixel holds `full_well` electrons; 0 is a sensor without noise.
 
-    Photons arrive at random, so the variance of n electrons is n (the normal distribution in place of Poisson's);
-    electronics add `read_noise` electrons, standard deviation.
+    The number of photons is random, so the variance of n electrons is n (with a normal in place of Poisson's
+    distribution). Electronics add `read_noise` electrons, as a standard deviation.
     """
     if not full_well:
         return light
@@ -130,9 +130,9 @@ def exposed(light: np.ndarray, full_well: float, read_noise: float, rng: np.rand
 
 
 def demosaiced(light: np.ndarray) -> np.ndarray:
-    """(H, W, 3) intensities of which a pixel measures one colour, by Bayer's pattern: red where row and column are
-    even, blue where both are odd, else green. The other two are means of the nearest pixels that measure them (bilinear
-    interpolation)."""
+    """Return (H, W, 3) intensities as from a Bayer mosaic, where each pixel measures one colour: red where row and
+    column are even, blue where both are odd, else green. The other two are means of the nearest pixels that measure
+    them (bilinear interpolation)."""
     from scipy.ndimage import convolve
 
     row, column = np.indices(light.shape[:2]) % 2
@@ -144,12 +144,12 @@ def demosaiced(light: np.ndarray) -> np.ndarray:
 
 
 def toned(value: np.ndarray, strength: float) -> np.ndarray:
-    """sRGB in [0, 1] with more contrast: `strength` of the curve 3 v^2 - 2 v^3, the rest unchanged."""
+    """Return sRGB in [0, 1] with more contrast: a mix of v and 3 v^2 - 2 v^3, the latter with weight `strength`."""
     return value + strength * (value * value * (3.0 - 2.0 * value) - value)
 
 
 def _walk(views: int, rng: np.random.Generator) -> np.ndarray:
-    """(views,) a smooth random curve with mean 0 that reaches 1 or -1."""
+    """Return (views,) a smooth random curve with mean 0 whose largest absolute value is 1."""
     from scipy.ndimage import gaussian_filter1d
 
     curve = gaussian_filter1d(rng.standard_normal(views), WALK_VIEWS / 4.0, mode="nearest")

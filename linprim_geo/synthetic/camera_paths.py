@@ -1,5 +1,5 @@
 """Camera poses for synthetic captures: rings, spheres and hand-held arcs around an object, walks through a room, and
-stations inside one."""
+camera positions inside a room."""
 
 from __future__ import annotations
 
@@ -10,48 +10,49 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 
 RING_ELEVATIONS_DEG = (-38.0, 6.0, 42.0)
-"""The rings of `orbit`: below, level and above, so that every side of an object is seen."""
+"""Elevations of the rings of `orbit`: below, level and above, so that all sides of an object are visible."""
 
 FIT_MARGIN = 0.04
-"""Share of the image's width and height that stays free on each side of an object."""
+"""Margin around the object on each side of the image, as a share of its width or height."""
 
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 ARC_DEG = 300.0
-"""Azimuth that the path `arc` covers unless another is said."""
+"""Default range of azimuths of the path `arc`."""
 
 ARC_ELEVATIONS_DEG = (12.0, 45.0)
 ARC_DISTANCE = 0.1
 ARC_AIM = 0.06
 ARC_ROLL_DEG = 2.0
-"""A hand-held arc: lowest and highest elevation; largest deviations of the distance from its mean, of the aim
-from the object's middle (both in units of the mean distance), and of the horizon."""
+"""Hand-held arc: lowest and highest elevation; largest deviation of the distance from its mean, and of the aim from the
+object's centre, both in units of the mean distance; largest roll."""
 
 ARC_JITTER = 0.15
-"""Share of those deviations that differs from view to view; the larger part changes slowly along the arc."""
+"""Share of these deviations that is independent between views; the rest changes slowly along the arc."""
 
 WALK_EYES = (1.2, 1.7)
-"""Lowest and highest camera of the path `walk` above the floor, metres."""
+"""Lowest and highest camera above the floor on the path `walk`, metres."""
 
 WALK_STEP, WALK_TURN_DEG = 0.4, 20.0
-"""So many metres and so many degrees of turning are equally long on the way of `walk`."""
+"""Metres and degrees of turning that count as equally long on the path `walk`."""
 
 CLEARANCE = 0.03
 NEAR = 0.08
 OPEN = 0.12
-"""Inside a room, in its sizes (`room_size`): cameras keep CLEARANCE from every surface, at most a fifth of a
-view is nearer than NEAR, and half of all directions see at least OPEN (or the camera would sit in a
-cupboard)."""
+"""Conditions on cameras inside a room, in units of `room_size`: every surface is at least CLEARANCE away, at most a
+fifth of a view is nearer than NEAR, and half of all directions see at least OPEN, which excludes cameras in
+cupboards."""
 
 LONGEST = 1.6
-"""A room whose diagonal is longer than this many times that across it, a street, has the size of a shorter one."""
+"""Limits `room_size` in long rooms such as streets: the largest ratio of the diagonal to that of the two shorter
+sides."""
 
 ROUNDS = 12
-"""Batches of random positions that are tried: enough for rooms of which a tenth is free."""
+"""Largest number of batches of random positions: enough for rooms with a tenth of free space."""
 
 
 def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
-    """(4, 4) world-to-camera of a camera at `position` looking at `target`, `up` (default z) upwards in the
+    """Return the (4, 4) world-to-camera pose at `position` that looks at `target`, with `up` (default z) upwards in the
     image."""
     forward = np.asarray(target, dtype=np.float64) - position
     forward = forward / np.linalg.norm(forward)
@@ -68,7 +69,7 @@ def look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray | None = No
 
 
 def fibonacci_directions(count: int, low: float = -1.0, high: float = 1.0, turn: float = 0.0) -> np.ndarray:
-    """(count, 3) unit vectors spread evenly over the zone of the sphere with z between `low` and `high`."""
+    """Return (count, 3) unit vectors, evenly spread over the zone of the sphere with z between `low` and `high`."""
     index = np.arange(count)
     z = high - (high - low) * (index + 0.5) / count
     angle = GOLDEN_ANGLE * index + turn
@@ -77,10 +78,10 @@ def fibonacci_directions(count: int, low: float = -1.0, high: float = 1.0, turn:
 
 
 def around(path: str, views: int, center: np.ndarray, distance: float, *, held_out: bool = False) -> list[np.ndarray]:
-    """(4, 4) world-to-camera poses that look at `center` from `distance`.
+    """Return (4, 4) world-to-camera poses that look at `center` from `distance`.
 
-    `orbit`: three rings; `hemisphere`: evenly over directions from 5 to 85 degrees up; `sphere`: over all
-    directions. `held_out` gives other poses between those: other elevations, other azimuths.
+    `orbit`: three rings; `hemisphere`: evenly over the directions at elevations from 5 to 85 degrees; `sphere`: over
+    all directions. With `held_out`, poses lie between those, at other elevations and azimuths.
     """
     if path == "orbit":
         rings = np.deg2rad(RING_ELEVATIONS_DEG)
@@ -106,11 +107,11 @@ def around(path: str, views: int, center: np.ndarray, distance: float, *, held_o
 def arc(
     views: int, test_views: int, center: np.ndarray, distance: float, degrees: float, seed: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks round `center`, camera in hand.
+    """Return training and held-out (4, 4) world-to-camera poses of a hand-held camera that is carried around `center`.
 
-    The azimuths of the training views are equally spaced over `degrees`; elevation, distance, aim and roll
-    wander slowly along the way within the limits above, and jitter from view to view. Every held-out view lies
-    between two training views, at least a quarter of their spacing from both, and jitters independently.
+    The azimuths of the training views are equally spaced over `degrees`. Elevation, distance, aim and roll drift slowly
+    along the path within the limits above, with independent jitter. Every held-out view lies between two training
+    views, at least a quarter of their spacing from both, and has its own jitter.
     """
     poses = []
     # Elevation, distance, aim along x, y and z, roll.
@@ -123,8 +124,9 @@ def arc(
 def _wandering(
     views: int, test_views: int, count: int, rng: np.random.Generator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The training and the held-out views of a hand-held camera: where along the way, in (0, 1), and `count` values in
-    [-1, 1] of each that wander slowly, by one to two and two to four waves, and jitter from view to view."""
+    """Return, for the training and the held-out views of a hand-held camera, their positions along the path, in (0, 1),
+    and `count` values each in [-1, 1]: sums of two slow waves, of one to two and of two to four periods, plus
+    independent jitter."""
     frequency = rng.uniform((1.0, 2.0), (2.0, 4.0), (count, 2))
     phase = rng.uniform(0.0, 2.0 * np.pi, (count, 2))
     step = (np.arange(test_views) + 0.5) / max(test_views, 1) * (views - 1)
@@ -138,17 +140,18 @@ def _wandering(
 
 
 def _held(center: np.ndarray, distance: float, azimuth: float, wander: np.ndarray) -> np.ndarray:
-    """(4, 4) world-to-camera of one view of `arc`; `wander` (6,) in [-1, 1] for elevation, distance, aim and roll."""
+    """Return the (4, 4) world-to-camera pose of one view of `arc`; `wander` (6,) in [-1, 1] sets elevation, distance,
+    aim and roll."""
     low, high = np.deg2rad(ARC_ELEVATIONS_DEG)
     elevation = 0.5 * (low + high) + 0.5 * (high - low) * wander[0]
     direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    # The three axes together deviate by no more than ARC_AIM.
+    # The deviation over all three axes is at most ARC_AIM.
     target = center + ARC_AIM * distance / np.sqrt(3.0) * wander[2:5]
     return _rolled(look_at(center + distance * (1.0 + ARC_DISTANCE * wander[1]) * direction, target), wander[5])
 
 
 def _rolled(pose: np.ndarray, share: float) -> np.ndarray:
-    """The pose turned about its optical axis by a share of ARC_ROLL_DEG."""
+    """Return the pose rotated about its optical axis by a share of ARC_ROLL_DEG."""
     roll = np.deg2rad(ARC_ROLL_DEG) * share
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
@@ -158,14 +161,13 @@ def _rolled(pose: np.ndarray, share: float) -> np.ndarray:
 def walk(
     stations: np.ndarray, targets: np.ndarray, views: int, test_views: int, seed: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks through a room, camera in hand.
+    """Return training and held-out (4, 4) world-to-camera poses of a hand-held camera that is carried through a room.
 
-    The feet go along the closed polyline `stations` (N, 3), metres; the camera looks at `targets` (N, 3), of which
-    there is one for each station and which are interpolated between them. To go round more than once, list the
-    stations again. The height above the feet (WALK_EYES), the aim and the roll wander and jitter as on an arc.
-    Training views are equally spaced, where WALK_STEP metres are as long as a turn by WALK_TURN_DEG and of both the
-    longer one counts; so neighbours are within both if the way is no longer than `views` such steps. Every held-out
-    view lies between two training views as on an arc.
+    The path on the floor is the closed polyline `stations` (N, 3), metres. The camera looks at `targets` (N, 3), one
+    for each station, interpolated in between. For several rounds, repeat the stations. The height above the floor
+    (WALK_EYES), the aim and the roll drift and jitter as on an arc. Training views are equally spaced along a length in
+    which WALK_STEP metres equal a turn by WALK_TURN_DEG, and the larger of both counts. So neighbours are within both
+    if the path is no longer than `views` such steps. Held-out views lie between two training views as on an arc.
     """
     share = np.linspace(0.0, 1.0, 64, endpoint=False)[None, :, None]
     feet, aims = (
@@ -194,10 +196,9 @@ def walk(
 
 
 def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views: int, camera: Camera) -> float:
-    """The smallest distance from `center` at which all vertices are in all pictures, with a margin.
+    """Return the smallest distance from `center` at which all vertices are inside all images, with a margin.
 
-    The size and focal lengths are those of `camera`, its principal point is taken to be the middle of the
-    image.
+    Size and focal lengths are those of `camera`; the principal point is assumed in the middle of the image.
     """
     from scipy.spatial import ConvexHull, QhullError
 
@@ -205,7 +206,7 @@ def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views:
     try:
         points = points[ConvexHull(points).vertices]
     except (QhullError, ValueError):
-        pass  # flat meshes have no hull; all vertices do as well
+        pass  # flat meshes have no hull; all vertices are used instead
     room_x = (0.5 - FIT_MARGIN) * camera.width / camera.fx
     room_y = (0.5 - FIT_MARGIN) * camera.height / camera.fy
     needed = 1.0001 * float(np.linalg.norm(points, axis=1).max())
@@ -219,17 +220,17 @@ def fitting_distance(path: str, vertices: np.ndarray, center: np.ndarray, views:
 def inside_out(
     caster: RayCaster, views: int, test_views: int, half_angles: tuple[float, float], seed: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses in the free space of a closed scene, looking around.
+    """Return training and held-out (4, 4) world-to-camera poses in the free space of a closed scene.
 
-    Positions at eye heights that keep clear of every surface (checked by rays in all directions); of many
-    candidate views those are chosen one after the other that see most of what has been seen least, so that
-    the surface is covered evenly and from different places.
+    Positions are at eye heights and keep a distance from every surface, which is checked by rays in all directions.
+    Views are chosen greedily from many candidates: each next one sees most of the points seen least so far, so that
+    the surface is covered evenly and from different positions.
 
     Args:
         half_angles: half the horizontal and vertical field of view, radians.
 
     Raises:
-        LinprimError: no free space with surfaces all around it.
+        LinprimError: there is no free space enclosed by surfaces, or not enough of it.
     """
     rng = np.random.default_rng(seed)
     positions, reach, probe = _free_positions(caster, max(160, 3 * (views + test_views)), rng)
@@ -240,7 +241,7 @@ def inside_out(
         offset = points - position
         length = np.linalg.norm(offset, axis=1)
         facing = np.abs((offset * normals).sum(1)) > 0.2 * length
-        # 1 % short of the point: the point's own face does not hide it.
+        # The ray ends 1 % before the point, as the point's own face would hide it.
         visible = facing & ~caster.occluded(position, offset, 0.99)
         for direction in fibonacci_directions(8, -0.6, 0.5, turn=rng.uniform(0.0, 2.0 * np.pi)):
             pose = look_at(position, position + direction)
@@ -278,8 +279,8 @@ def inside_out(
 def surface_samples(
     caster: RayCaster, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Area-uniform points (N, 3) on the mesh, their unit normals (N, 3), faces (N,) and barycentrics (N,
-    2)."""
+    """Return points (N, 3) on the mesh, uniform by area, with unit normals (N, 3), faces (N,) and barycentric
+    coordinates (N, 2)."""
     corners = caster.vertices[caster.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
@@ -293,12 +294,12 @@ def surface_samples(
 
 
 def room_size(caster: RayCaster) -> float:
-    """The bounding box's diagonal, but at most LONGEST times that of its two smaller sides."""
+    """Return the diagonal of the bounding box, but at most LONGEST times the diagonal of its two shorter sides."""
     return min(caster.diagonal, LONGEST * float(np.linalg.norm(np.sort(caster.upper - caster.lower)[:2])))
 
 
 def _free_positions(caster: RayCaster, wanted: int, rng: np.random.Generator):
-    """Camera positions (P, 3), the distances (P, D) seen from them, and the probing directions (D, 3)."""
+    """Return camera positions (P, 3), the distances (P, D) to the surface from them, and the ray directions (D, 3)."""
     probe = fibonacci_directions(192)
     extent = caster.upper - caster.lower
     low = caster.lower + extent * np.array([0.04, 0.04, 0.3])

@@ -1,4 +1,4 @@
-"""The cameras of a synthetic capture: poses of the chosen path, focal lengths, and the distance from an object."""
+"""The cameras of a synthetic capture: poses of the chosen path, focal lengths, and the distance to an object."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from linprim_geo.synthetic.textured import TexturedMesh
 def place_cameras(
     surface: TexturedMesh, caster: RayCaster, options: SynthOptions, path: str, fov: float
 ) -> tuple[list[Camera], list[Camera], float | None]:
-    """Training cameras, held-out cameras, and their distance from the middle of the surface (None inside it).
+    """Return training cameras, held-out cameras, and their distance from the centre of the surface (None inside it).
 
     Args:
-        surface: what the cameras look at, without a table.
-        caster: that of `surface`; only cameras inside it need it.
-        options: without a distance it is the smallest one at which the surface is within all pictures (of an arc: of
-            a hemisphere).
-        path, fov: the options', or what suits the surface.
+        surface: the object or room to photograph, without a table.
+        caster: of `surface`; used only for cameras inside.
+        options: if no distance is given, it is the smallest at which the surface is inside all images (for an arc:
+            all images of a hemisphere).
+        path, fov: those of the options, or the surface's defaults.
 
     Raises:
-        LinprimError: the distance or the offset has no meaning, or there is no room for cameras inside.
+        LinprimError: the distance or the offset is invalid, or there is no room for cameras inside.
     """
     width, height = options.width_height
     focal = 0.5 * width / np.tan(0.5 * np.deg2rad(fov))
@@ -46,7 +46,8 @@ def place_cameras(
 
 
 def _poses_around(surface: TexturedMesh, options: SynthOptions, path: str, base: Camera):
-    """Training and held-out (4, 4) world-to-camera poses around the surface, and their distance from its middle."""
+    """Return training and held-out (4, 4) world-to-camera poses around the surface, and their distance from its
+    centre."""
     vertices = surface.used_vertices
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     radius = float(np.linalg.norm(vertices - center, axis=1).max())
@@ -70,5 +71,5 @@ def _poses_around(surface: TexturedMesh, options: SynthOptions, path: str, base:
 
 
 def _zoomed(cameras: list[Camera], zoom: float) -> list[Camera]:
-    """The cameras, every third one with `zoom` times the focal length."""
+    """Return the cameras, every third one with `zoom` times the focal length."""
     return [replace(c, fx=c.fx * zoom, fy=c.fy * zoom) if i % 3 == 1 else c for i, c in enumerate(cameras)]

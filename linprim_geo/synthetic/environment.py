@@ -1,4 +1,4 @@
-"""A far background for synthetic captures: a room seen from its middle, whose colour depends on the direction alone."""
+"""A distant background for synthetic captures: a room seen from its centre, a function of direction only."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 
 BLUR = float(np.deg2rad(1.0))
-"""Angle over which every edge goes from one colour to the other, radians: out of focus, as behind a near object."""
+"""Width of the transition between colours at every edge, radians: out of focus, as behind a near object."""
 
 FLOOR, CEILING = -1.25, 1.45
-"""Heights of floor and ceiling above the eye, metres."""
+"""Heights of floor and ceiling relative to the viewpoint, metres."""
 
 BASEBOARD = 0.12
-"""Height of the white board along the foot of the walls, metres."""
+"""Height of the white baseboard, metres."""
 
 PLANK = 0.34
-"""Width of the boards of the floor, metres."""
+"""Width of the floorboards, metres."""
 
 DIRECTIONS_AT_ONCE = 8192
-"""Small enough that the temporaries of one step stay in cache."""
+"""Directions per step. Temporaries then stay in cache."""
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A plain rectangle on a wall: `left` and `right` are azimuths from the wall's normal (radians), `low` and
-    `high` heights above the eye (metres)."""
+    """A rectangle of one colour on a wall: `left` and `right` are azimuths from the wall's normal (radians), `low` and
+    `high` heights relative to the viewpoint (metres)."""
 
     wall: int
     left: float
@@ -38,7 +38,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class BookRow:
-    """Narrow strips of colours (S, 3) side by side, between azimuths `edges` (S + 1,) from the wall's normal."""
+    """Adjacent narrow strips of colours (S, 3), with edges at azimuths `edges` (S + 1,) from the wall's normal."""
 
     wall: int
     edges: np.ndarray
@@ -49,11 +49,11 @@ class BookRow:
 
 @dataclass(frozen=True)
 class SyntheticEnvironment:
-    """A box-shaped room round the eye, z up; call it with directions to get colours.
+    """A box-shaped room around the viewpoint, z up; called with directions, it returns colours.
 
-    `turn` is the azimuth of the normal of wall 0 (radians), `reach` (4,) the distances of the walls (metres),
-    `walls` (4, 3) and `boards` (B, 3) the colours of the walls and of the floor's boards, `items` what is on
-    the walls, each over those before it.
+    `turn` is the azimuth of the normal of wall 0 (radians), `reach` (4,) the distances of the walls (metres). `walls`
+    (4, 3) and `boards` (B, 3) are the colours of the walls and of the floorboards. `items` on the walls are painted in
+    this order.
     """
 
     turn: float
@@ -63,7 +63,7 @@ class SyntheticEnvironment:
     items: tuple[Rectangle | BookRow, ...]
 
     def __call__(self, directions: np.ndarray) -> np.ndarray:
-        """Colours (R, 3) float32 in [0, 1] of directions (R, 3) of any length but 0."""
+        """Return colours (R, 3) float32 in [0, 1] of directions (R, 3) of any length but 0."""
         color = np.empty((len(directions), 3), dtype=np.float32)
         for start in range(0, len(directions), DIRECTIONS_AT_ONCE):
             rows = slice(start, start + DIRECTIONS_AT_ONCE)
@@ -72,7 +72,7 @@ class SyntheticEnvironment:
 
     def _block(self, directions: np.ndarray) -> np.ndarray:
         azimuth = _wrapped(np.arctan2(directions[:, 1], directions[:, 0]) - np.float32(self.turn))
-        # Straight up and down the slope is infinite; 1e4 is 0.006 degrees from there.
+        # Straight up and down the slope is infinite; it is limited to 1e4, 0.006 degrees from there.
         level = np.hypot(directions[:, 0], directions[:, 1])
         slope = directions[:, 2] / np.maximum(level, 1e-4 * np.abs(directions[:, 2]) + 1e-30)
         wall, distance = self._walls_met(azimuth)
@@ -91,27 +91,27 @@ class SyntheticEnvironment:
         return np.clip(color, 0.0, 1.0)
 
     def _corners(self) -> np.ndarray:
-        """(4,) azimuths of the corners: between walls 2 and 3, 3 and 0, 0 and 1, 1 and 2."""
+        """Return (4,) azimuths of the corners: between walls 2 and 3, 3 and 0, 0 and 1, 1 and 2."""
         a, b, c, d = self.reach
         return np.arctan2([-d, -d, b, b], [-c, a, a, -c]).astype(np.float32)
 
     def _walls_met(self, azimuth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Number of the wall (R,) and its horizontal distance (R,) at an azimuth."""
+        """Return the number (R,) of the wall at each azimuth, and its horizontal distance (R,)."""
         wall = np.array([2, 3, 0, 1, 2])[np.searchsorted(self._corners(), azimuth)]
         away = _wrapped(azimuth - (0.5 * np.pi * wall).astype(np.float32))
         return wall, self.reach.astype(np.float32)[wall] / np.cos(away)
 
     def _wall_colors(self, azimuth: np.ndarray) -> np.ndarray:
-        """The plain walls, a little brighter on one side of the room than on the other."""
+        """Return the colours of the bare walls, a little brighter on one side of the room than on the other."""
         color = _strips(azimuth, self._corners(), self.walls[[2, 3, 0, 1, 2]], BLUR)
         return color * (np.float32(1.0) + np.float32(0.04) * np.sin(azimuth + 1.0))[:, None]
 
     def _floor_colors(self, azimuth: np.ndarray, slope: np.ndarray) -> np.ndarray:
-        """Boards along one axis of the room, with broad waves of light and dark along them."""
+        """Return the colours of floorboards along one axis of the room, with broad waves of brightness."""
         reach = FLOOR / slope
         x, y = reach * np.cos(azimuth), reach * np.sin(azimuth)
         edges = PLANK * (np.arange(1, len(self.boards)) - 0.5 * len(self.boards))
-        # An angle of BLUR is so much on the floor, where the eye sees it most aslant.
+        # Length on the floor that corresponds to an angle of BLUR, along the direction of view.
         blur = np.minimum(BLUR * reach * (1.0 + slope * slope) / -slope, PLANK)
         color = _strips(y, edges.astype(np.float32), self.boards, blur)
         light = 1.0 + 0.05 * np.sin(2.9 * x + 1.7 * y) + 0.04 * np.sin(7.1 * x - 3.1 * y + 2.0)
@@ -119,7 +119,7 @@ class SyntheticEnvironment:
 
 
 def synthetic_environment(seed: int) -> SyntheticEnvironment:
-    """A room with a window, a door, a shelf of books, pictures and furniture; `seed` draws layout and colours."""
+    """Return a room with a window, a door, a bookshelf, pictures and furniture; `seed` draws layout and colours."""
     rng = np.random.default_rng(seed)
     window, door, shelf, pictures = rng.permutation(4)
     reach = rng.uniform(1.9, 2.9, 4)
@@ -129,7 +129,7 @@ def synthetic_environment(seed: int) -> SyntheticEnvironment:
         for _ in range(4)
     ]
     tone = np.array(colorsys.hsv_to_rgb(rng.uniform(0.05, 0.09), rng.uniform(0.4, 0.55), rng.uniform(0.42, 0.58)))
-    # Boards enough for the longest room, 2.9 m each way and more at the corners.
+    # Enough boards for the longest room, which extends 2.9 m each way and more at the corners.
     boards = tone * rng.uniform(0.88, 1.1, (26, 1))
     items = [
         *_window(rng, int(window)),
@@ -147,7 +147,7 @@ def synthetic_environment(seed: int) -> SyntheticEnvironment:
 
 
 def _window(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
-    """A bright window of two panes in a white frame, and a low cupboard under it."""
+    """Return a bright window of two panes in a white frame, and a low cupboard under it."""
     left = rng.uniform(-0.6, -0.25)
     right, low = left + rng.uniform(0.55, 0.75), rng.uniform(-0.45, -0.25)
     middle = 0.5 * (left + right)
@@ -161,7 +161,7 @@ def _window(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
 
 
 def _door(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
-    """A coloured door in a frame, and a picture beside it."""
+    """Return a coloured door in a frame, and a picture beside it."""
     left = rng.uniform(-0.55, -0.3)
     right, at = left + 0.42, left + rng.uniform(0.58, 0.7)
     return [
@@ -172,7 +172,7 @@ def _door(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
 
 
 def _shelf(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
-    """Shelves from the floor upwards, full of narrow coloured backs of books."""
+    """Return shelves from the floor upwards, full of narrow coloured spines of books."""
     left = rng.uniform(-0.65, -0.45)
     right = left + rng.uniform(0.85, 1.05)
     wood = np.array([0.36, 0.24, 0.17], dtype=np.float32)
@@ -190,7 +190,7 @@ def _shelf(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
 
 
 def _pictures(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
-    """Two pictures and a sofa."""
+    """Return two pictures and a sofa."""
     left = rng.uniform(-0.6, -0.4)
     cloth = _colored(rng, 0.5, 0.5)
     return [
@@ -204,7 +204,7 @@ def _pictures(rng: np.random.Generator, wall: int) -> list[Rectangle | BookRow]:
 def _picture(
     rng: np.random.Generator, wall: int, left: float, low: float, width: float, height: float
 ) -> list[Rectangle]:
-    """A framed picture of two areas of colour, `width` in radians and `height` in metres."""
+    """Return a framed picture of two areas of colour, `width` in radians and `height` in metres."""
     horizon = low + height * rng.uniform(0.35, 0.6)
     inner = (left + 0.03, left + width - 0.03)
     return [
@@ -230,7 +230,7 @@ def _lay_over(
     height: np.ndarray,
     height_blur: np.ndarray,
 ) -> None:
-    """Paints an item over the colours (R, 3), with soft edges."""
+    """Paint an item over the colours (R, 3), in place, with soft edges."""
     away = _wrapped(azimuth - np.float32(0.5 * np.pi * item.wall))
     left, right = (item.left, item.right) if isinstance(item, Rectangle) else item.edges[[0, -1]]
     rows = np.flatnonzero((wall == item.wall) & (away > left - BLUR) & (away < right + BLUR))
@@ -242,8 +242,8 @@ def _lay_over(
 
 
 def _strips(x: np.ndarray, edges: np.ndarray, colors: np.ndarray, blur: np.ndarray | float) -> np.ndarray:
-    """Colours (R, 3) at x (R,): `colors` (S, 3) between `edges` (S - 1,), each edge softened over `blur`."""
-    # The nearest edge decides; half-way between two edges both give the colour of the strip there.
+    """Return colours (R, 3) at x (R,): `colors` (S, 3) between `edges` (S - 1,), with transitions of width `blur`."""
+    # Only the nearest edge is evaluated; half-way between two edges both give the colour of the strip there.
     nearest = np.searchsorted(0.5 * (edges[1:] + edges[:-1]), x)
     weight = _step(x - edges[nearest], blur)[:, None]
     before = colors[nearest]
@@ -251,11 +251,11 @@ def _strips(x: np.ndarray, edges: np.ndarray, colors: np.ndarray, blur: np.ndarr
 
 
 def _step(x: np.ndarray, width: np.ndarray | float) -> np.ndarray:
-    """3 t^2 - 2 t^3 with t = x / width + 1/2 cut to [0, 1]: from 0 to 1 over `width`, 1/2 at x = 0."""
+    """Return 3 t^2 - 2 t^3 with t = x / width + 1/2 clipped to [0, 1]: a smooth step over `width`, 1/2 at x = 0."""
     t = np.clip(x / width + np.float32(0.5), 0.0, 1.0).astype(np.float32)
     return t * t * (3.0 - 2.0 * t)
 
 
 def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """The angle from -pi to pi, float32."""
+    """Return the angle in -pi to pi, float32."""
     return (angle - np.float32(2.0 * np.pi) * np.rint(angle / np.float32(2.0 * np.pi))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The folder of a synthetic capture: its entries in transforms files, and how it comes into being as a whole."""
+"""The folder of a synthetic capture: entries of its transforms files, and its creation by a single rename."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from linprim_geo.synthetic.photos import photo_name
 
 
 def shared_keys(camera: Camera, unit: float, options: SynthOptions, name_of_unit: str) -> dict:
-    """What all frames of a transforms file have in common; `unit` is that of the depth in PNG files."""
+    """Return the entries that all frames of a transforms file share; `unit` is that of the depth in PNG files."""
     lens = {"camera_model": "OPENCV", "k1": options.distortion} if options.distortion else {"camera_model": "PINHOLE"}
     return {
         **lens,
@@ -35,7 +35,7 @@ def shared_keys(camera: Camera, unit: float, options: SynthOptions, name_of_unit
 
 
 def frame_entry(split: str, number: int, camera: Camera, options: SynthOptions) -> dict:
-    """The entry of one view in a transforms file."""
+    """Return the entry of one view in a transforms file."""
     name = f"{split}/{number:03d}"
     opengl = camera.camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0])
     zoomed = {
@@ -53,7 +53,7 @@ def frame_entry(split: str, number: int, camera: Camera, options: SynthOptions) 
 
 
 def prepare_folder(out: Path, overwrite: bool) -> Path:
-    """A temporary folder beside `out`, after making sure that `out` may be made."""
+    """Check that `out` may be written, and return a new temporary folder beside it."""
     if out.exists() and not out.is_dir():
         raise LinprimError(f"{out}: is a file, a folder to make is wanted")
     if out.is_dir() and any(out.iterdir()):
@@ -69,7 +69,7 @@ def prepare_folder(out: Path, overwrite: bool) -> Path:
 
 
 def publish_folder(temporary: Path, out: Path) -> None:
-    """Puts the finished folder in its place; what was there is removed only after that."""
+    """Move the finished folder to its place; a previous one is deleted only afterwards."""
     os.chmod(temporary, 0o755)
     old = None
     if out.exists():

@@ -1,5 +1,5 @@
-"""A large furnished hall seen from inside, with a checker on every surface: the built-in scene in which stereo is
-hard or easy by the strength of its texture."""
+"""A large furnished hall seen from inside, with a checkerboard on every surface. The strength of this texture makes
+stereo easy or hard."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from linprim_geo.synthetic.shapes import SEGMENTS, Tags, operation
 from linprim_geo.synthetic.textured import POINTS_AT_ONCE, TexturedMesh
 
-# Width, depth and height of the air, and the side of a square of the checker, in metres.
+# Width, depth and height of the hall, and the side of a square of the checkerboard, in metres.
 SIZE, SQUARE = (9.0, 7.0, 3.4), 0.4
-# Contrast of the checker's light and dark squares, and the spread of single ones about these, at detail 1.
+# Contrast of light and dark squares, and standard deviation of the colours of single squares, both at detail 1.
 CONTRAST, SPREAD = 0.32, 0.08
-# Squares of a side in which the single ones repeat.
+# Period of the random colours of squares, in squares.
 PERIOD = 32
 
 
 def hall(detail: float = 1.0) -> TexturedMesh:
-    """A hall of 9 x 7 x 3.4 m with columns, tables, crates, steps, a cylinder, a cone and balls: one closed surface
-    whose faces look into the air. In metres, z up, floor at z = 0."""
+    """Return a hall of 9 x 7 x 3.4 m with columns, tables, crates, steps, a cylinder, a cone and balls: one closed
+    surface with faces towards the inside. Units are metres; z is up, the floor at z = 0."""
     from manifold3d import Manifold
 
     tags = Tags()
@@ -56,9 +56,10 @@ def hall(detail: float = 1.0) -> TexturedMesh:
 
 @dataclass(frozen=True)
 class CheckerAlbedo:
-    """Squares of SQUARE metres, light and dark in turn, each of a shade of its own: a solid texture.
+    """A solid texture: a checkerboard of cubes of SQUARE metres, light and dark in turn, each with its own shade.
 
-    `part` (F,) piece of each face, `base` (P, 3) its colour, `shade` (PERIOD, PERIOD, PERIOD, 3) what a square adds.
+    `part` (F,) is the piece of each face, `base` (P, 3) its colour, `shade` (PERIOD, PERIOD, PERIOD, 3) the colour that
+    a cube adds.
     """
 
     part: np.ndarray
@@ -77,7 +78,7 @@ class CheckerAlbedo:
         color = np.empty((len(points), 3), dtype=np.float32)
         for start in range(0, len(points), POINTS_AT_ONCE):
             rows = slice(start, start + POINTS_AT_ONCE)
-            # No wall lies on the border of two layers of squares.
+            # The offset keeps walls off the boundaries between layers of cubes.
             cell = np.floor(np.asarray(points[rows]) / SQUARE + (0.37, 0.21, 0.43)).astype(np.int64) % PERIOD
             color[rows] = self.base[self.part[face[rows]]] + self.shade[tuple(cell.T)]
         return np.clip(color, 0.02, 0.98, out=color)

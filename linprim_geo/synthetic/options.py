@@ -1,4 +1,4 @@
-"""The options of a synthetic capture, and which of them exclude each other."""
+"""The options of a synthetic capture, and the check for options that exclude each other."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Color = tuple[float, float, float]
 
 PATHS = ("orbit", "hemisphere", "sphere", "arc", "inside-out")
 
-# Pixels along a side of an image.
+# Limits of the image side, in pixels.
 SMALLEST_SIDE, LARGEST_SIDE = 8, 16384
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """640x480, or 320 for 320x320."""
+    """Parse 640x480, or 320 for 320x320."""
     width, cross, height = text.lower().partition("x")
     height = height if cross else width
     if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
@@ -27,7 +27,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_pair(text: str) -> tuple[float, float]:
-    """Two numbers with a comma between them."""
+    """Parse two numbers separated by a comma."""
     try:
         x, y = (float(part) for part in text.split(","))
     except ValueError:
@@ -39,22 +39,22 @@ def parse_pair(text: str) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class SynthOptions:
-    """How a surface is photographed.
+    """The settings for photographing a surface.
 
-    `path` is three rings, a half or a whole sphere, a walk with the camera in hand, or stations inside a room.
-    `distance` is from the middle of the bounding box (on an arc its mean); without it the object fills the frame.
-    `shading` is by two distant lamps without shadows (Lambert), to which `specular` adds highlights (Phong's, exponent
-    12). `points` lie uniform by area (with a table: as dense as the pixels that show it), each observed by at least
-    three training views; with `point_noise` their observations stay exact, and their error is the mean reprojection
-    error in pixels. A gain of `exposure_drift` is exp of a uniform number within it of 0 for all channels, and a
-    quarter of it for each; the geometric mean over the photographs is 1, and held-out ones have none. `table` is square
-    and of wood, its side so many times the object's largest horizontal extent; cameras stay above it. Half of the
-    variance of `noise` grows with the signal.
+    `path` is three rings, a half or a whole sphere, a hand-held arc, or positions inside a room. `distance` is measured
+    from the centre of the bounding box (on an arc it is the mean); by default the object fills the frame. `shading` is
+    by two distant lamps without shadows (Lambert), to which `specular` adds highlights (Phong's, exponent 12). `points`
+    are uniform by area (with a table: as dense as the pixels that show it), each observed by at least three training
+    views. With `point_noise` their observations stay exact, and their error is the mean reprojection error in pixels.
+    `exposure_drift` gives each training photograph a gain: exp of a sum of two uniform numbers, one up to it in either
+    direction for all channels, and one up to a quarter of it for each channel. The geometric mean over the photographs
+    is 1; held-out ones have no gain. `table` adds a square wooden table whose side is that many times the object's
+    largest horizontal extent; cameras stay above it. Half of the variance of `noise` grows with the signal.
 
-    From `camera` to `tone` is what light goes through in a camera (`camera_effects` has the formulas); `pose_error` and
-    `focal_error` change the cameras that are written, of training and held-out views, not the photographs
-    (`pose_errors`). Depth, normals and the reference stay exact. With `points_from` photographs the points are
-    triangulated from the training photographs with the cameras as written, as many as there are.
+    `camera` to `tone` are effects of a camera on the light (formulas in `camera_effects`). `pose_error` and
+    `focal_error` change the written cameras, of training and held-out views, but not the photographs (`pose_errors`).
+    Depth, normals and the reference stay exact. With `points_from` photographs, the points are triangulated from the
+    training photographs with the cameras as written, as many as are found.
     """
 
     views: int = option(60, "training views", low=2)
@@ -149,7 +149,7 @@ class SynthOptions:
 
     @property
     def width_height(self) -> tuple[int, int]:
-        """`size` as pixels along both sides.
+        """`size` as width and height in pixels.
 
         Raises:
             LinprimError: not one or two whole numbers from SMALLEST_SIDE to LARGEST_SIDE.
@@ -161,12 +161,12 @@ class SynthOptions:
 
 
 def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
-    """Refuses options that exclude each other; `path` and `transparent` are what was chosen where nothing was said.
+    """Reject options that exclude each other; `path` and `transparent` are the values in effect, including defaults.
 
     Raises:
-        LinprimError: a table that is no table or seen from below, an arc that is not walked, two backgrounds, JPEG or
-            motion blur with alpha, read noise of a sensor without electrons, points from distorted photographs, options
-            of path tracing for a scene without.
+        LinprimError: a table smaller than the object or seen from below, an arc with another path, two backgrounds,
+            JPEG or motion blur with alpha, read noise of a sensor without electrons, points from distorted photographs,
+            or options of path tracing for another scene.
     """
     for entry in changed_options(options):
         if options.realism is None and entry.name in ("samples", "denoise", "tracer"):
@@ -206,10 +206,10 @@ def check_together(options: SynthOptions, path: str, transparent: bool) -> None:
 
 
 def background_color(value: str | Color) -> Color | None:
-    """The colour of an opaque background, None for a transparent one.
+    """Return the colour of an opaque background, None for a transparent one.
 
     Raises:
-        LinprimError: neither a name nor three numbers in [0, 1].
+        LinprimError: `value` is neither a name nor three numbers in [0, 1].
     """
     named = {"transparent": None, "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
     if isinstance(value, str) and value in named:

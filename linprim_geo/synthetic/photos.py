@@ -1,4 +1,4 @@
-"""The photographs of a synthetic capture as a camera stores them: sensor noise, rounding, PNG and JPEG."""
+"""The photographs of a synthetic capture as files: sensor noise, rounding, PNG and JPEG."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 
 def sensor_noise(values: np.ndarray, strength: float, seed: tuple[int, ...]) -> np.ndarray:
-    """Colours (H, W, 3) float32 with noise, independent per pixel and channel, not cut to [0, 1].
+    """Return colours (H, W, 3) float32 with noise, independent per pixel and channel, not clipped to [0, 1].
 
-    Its variance at colour v is (strength / 255)^2 (1/2 + v): read noise and, in proportion to the signal, shot
-    noise, of equal variance at v = 1/2, where the standard deviation is `strength` / 255.
+    Its variance at colour v is (strength / 255)^2 (1/2 + v): read noise plus shot noise, which is proportional to the
+    signal. Both are equal at v = 1/2, where the standard deviation is `strength` / 255.
     """
     if strength == 0.0:
         return values
@@ -21,25 +21,25 @@ def sensor_noise(values: np.ndarray, strength: float, seed: tuple[int, ...]) -> 
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1], cut to that, as the nearest uint8."""
+    """Return values clipped to [0, 1] as the nearest uint8."""
     return (np.clip(values, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def photo_name(split: str, number: int, jpeg: int) -> str:
-    """The path of a photograph in the folder of the capture."""
+    """Return the path of a photograph in the folder of the capture."""
     return f"{split}/{number:03d}.{'jpg' if jpeg else 'png'}"
 
 
 def save_png(path: Path, pixels: np.ndarray) -> None:
-    """Writes (H, W), (H, W, 3) or (H, W, 4) pixels."""
+    """Write (H, W), (H, W, 3) or (H, W, 4) pixels as PNG."""
     from PIL import Image
 
-    # Level 3 is a third of the time of Pillow's 6 for files a few per cent larger.
+    # Level 3 takes a third of the time of Pillow's default of 6, for files a few per cent larger.
     Image.fromarray(np.ascontiguousarray(pixels)).save(path, compress_level=3)
 
 
 def save_photo(path: Path, pixels: np.ndarray, jpeg: int) -> None:
-    """Writes (H, W, 3) uint8 as JPEG of quality `jpeg` (colour at half resolution), or any pixels as PNG if it is 0."""
+    """Write (H, W, 3) uint8 as JPEG of quality `jpeg` (chroma at half resolution), or any pixels as PNG if it is 0."""
     from PIL import Image
 
     if jpeg:

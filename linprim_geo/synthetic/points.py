@@ -1,5 +1,4 @@
-"""Points as structure from motion would leave them: on the surface, with tracks, colours and reprojection
-errors."""
+"""Surface points in place of structure from motion, with tracks, colours and reprojection errors."""
 
 from __future__ import annotations
 
@@ -19,10 +18,10 @@ from linprim_geo.synthetic.photos import photo_name
 from linprim_geo.synthetic.textured import TexturedMesh
 
 MAX_TRACK = 8
-"""At most so many observations are written for a point; SfM tracks are about this long."""
+"""Largest number of observations written for a point; tracks of structure from motion are about this long."""
 
 MIN_FACING = 0.15
-"""Points are observed at angles of more than 9 degrees from the surface, as feature matching needs."""
+"""Least sine of the angle between a view and the surface at an observed point, 9 degrees, as feature matching needs."""
 
 
 def sample_points(
@@ -37,11 +36,11 @@ def sample_points(
     distortion: float = 0.0,
     by_pixels: bool = False,
 ) -> ObservedPoints:
-    """Surface points, each seen by at least three of the cameras (two if there are no more).
+    """Return surface points, each seen by at least three of the cameras (two if there are only two).
 
-    They are uniform by area or, `by_pixels`, as dense as the pixels that show the surface, as are the keypoints
-    of photographs. `light(color, face, direction)` turns albedo into the colour seen along `direction`. Fewer than
-    `count` points come back only if the cameras see almost nothing of the surface.
+    They are uniform by area or, with `by_pixels`, as dense as the pixels that show the surface, like the keypoints
+    of photographs. `light(color, face, direction)` returns the colour seen along `direction` for an albedo. There are
+    fewer than `count` points only if the cameras see almost nothing of the surface.
     """
     rng = np.random.default_rng(seed + 1)
     wanted = count
@@ -66,7 +65,7 @@ def sample_points(
         return ObservedPoints(empty, empty.astype(np.uint8), none.astype(np.float32), none, none, np.zeros((0, 2)))
     xyz, _, face, bary, seen = (np.concatenate(items)[:wanted] for items in zip(*batches, strict=True))
 
-    # Of the views that see a point, a random MAX_TRACK are kept.
+    # A random MAX_TRACK of the views that see a point are kept.
     order = np.where(seen, rng.uniform(size=seen.shape), 2.0)
     rank = np.argsort(np.argsort(order, axis=1), axis=1)
     point, image = np.nonzero(seen & (rank < MAX_TRACK))
@@ -89,8 +88,8 @@ def sample_points(
 def pixel_samples(
     caster: RayCaster, cameras: list[Camera], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What rays through random positions in random pictures meet, as `camera_paths.surface_samples`; no more than
-    `count`."""
+    """Return the hits of rays through random positions in random images, at most `count`, in the form of
+    `camera_paths.surface_samples`."""
     chosen = rng.integers(len(cameras), size=count)
     place = rng.uniform(size=(count, 2))
     origins, rays = np.empty((count, 3)), np.empty((count, 3))
@@ -108,24 +107,24 @@ def pixel_samples(
 
 
 def project(camera: Camera, xyz: np.ndarray, distortion: float) -> tuple[np.ndarray, np.ndarray]:
-    """`Camera.project` through a lens of radial distortion k1: pixels (P, 2), depths (P,)."""
+    """Return pixels (P, 2) and depths (P,) of points, as `Camera.project`, with radial distortion k1."""
     pixel, depth = camera.project(xyz)
     if not distortion:
         return pixel, depth
     focal, middle = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     plain = (pixel - middle) / focal
     squared = (plain**2).sum(1, keepdims=True)
-    # Beyond the radius where it stops growing the lens folds over: nothing of that is in the picture.
+    # Beyond the radius where the distorted radius stops growing, the mapping folds over; such points are not visible.
     folded = 1.0 + 3.0 * distortion * squared <= 0
     return np.where(folded, np.nan, plain * (1.0 + distortion * squared) * focal + middle), depth
 
 
 def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, distortion: float) -> np.ndarray:
-    """(len(rows), len(columns), 3) camera-space rays with z = 1 through positions in the image, through a lens of
-    distortion k1.
+    """Return (len(rows), len(columns), 3) camera-space rays with z = 1 through positions in the image of a lens with
+    radial distortion k1.
 
     Raises:
-        LinprimError: the lens folds over inside the image.
+        LinprimError: the distortion folds over inside the image.
     """
     x, y = np.meshgrid((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy)
     scale = np.ones_like(x)
@@ -143,7 +142,7 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray, distortio
 
 
 def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray, distortion: float = 0.0) -> np.ndarray:
-    """(P,) bool: the point is in the picture, not hidden, and not at a grazing angle."""
+    """Return (P,) bool: which points are in the image, not hidden, and not at a grazing angle."""
     pixel, depth = project(camera, xyz, distortion)
     towards = xyz - camera.center
     seen = depth > 0
@@ -152,7 +151,7 @@ def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray,
         seen &= (pixel > 0.5).all(1) & (pixel < np.array([camera.width, camera.height]) - 0.5).all(1)
     rows = np.flatnonzero(seen)
     if len(rows):
-        # Stop a ten-thousandth of the diagonal short, or the point's own face would hide it.
+        # Rays end a ten-thousandth of the diagonal before the point, as its own face would hide it.
         margin = 1e-4 * caster.diagonal / np.linalg.norm(towards[rows], axis=1)
         seen[rows] = ~caster.occluded(camera.center, towards[rows], 1.0 - margin)
     return seen
@@ -161,7 +160,7 @@ def sees(caster: RayCaster, camera: Camera, xyz: np.ndarray, normal: np.ndarray,
 def write_colmap(
     folder: Path, cameras: list[Camera], cloud: ObservedPoints, distortion: float = 0.0, jpeg: int = 0
 ) -> None:
-    """A COLMAP model (binary) of the training views, with the points and their observations."""
+    """Write a COLMAP model (binary) of the training views, with the points and their observations."""
     from linprim_geo.geometry.load_pycolmap import pycolmap
 
     folder.mkdir(parents=True)
@@ -204,5 +203,5 @@ def write_colmap(
 
 
 def write_points(path: Path, cloud: ObservedPoints) -> None:
-    """A binary PLY of x y z (double, so that nothing is lost far from the origin) and red green blue."""
+    """Write a binary PLY of x y z (double, to keep digits far from the origin) and red green blue."""
     write_ply(path, xyz_columns(cloud.xyz.astype(np.float64)) | color_columns(cloud.rgb))

@@ -1,4 +1,4 @@
-"""Points that come from the photographs of a synthetic capture, as in a real one."""
+"""Points triangulated from the photographs of a synthetic capture, as in a real one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from linprim_geo.geometry.feature_points import ObservedPoints, file_name, relia
 
 
 def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, threads: int) -> ObservedPoints:
-    """What several photographs agree on: keypoints, matched and triangulated with the given cameras."""
+    """Return reliable points: keypoints of the photographs, matched and triangulated with the given cameras."""
 
     def copies(folder: Path) -> None:
         for number, path in enumerate(photos):
@@ -23,7 +23,7 @@ def photographed_points(cameras: list[Camera], photos: list[Path], seed: int, th
 
 
 def save_opaque(source: Path, target: Path) -> None:
-    """A copy of a photograph as PNG without alpha; what is transparent becomes black."""
+    """Copy a photograph as PNG without alpha, over black."""
     from PIL import Image
 
     with Image.open(source) as photo:
@@ -33,7 +33,7 @@ def save_opaque(source: Path, target: Path) -> None:
 
 
 def photographed_colors(cloud: ObservedPoints, photos: list[Path]) -> ObservedPoints:
-    """The cloud with the colours of the pixels at the first observation of each point."""
+    """Return the cloud with the colour of the pixel at the first observation of each point."""
     from PIL import Image
 
     rgb = cloud.rgb.copy()

@@ -1,4 +1,4 @@
-"""Cameras as structure from motion would report them: a little beside the true ones."""
+"""Cameras with errors of poses and focal lengths, as from structure from motion."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import numpy as np
 from linprim_geo.geometry.camera import Camera
 
 SEED = 10
-"""Tells the random numbers of the poses from those of other parts of a capture."""
+"""Separates the random numbers of the poses from those of other parts of a capture."""
 
 
 def reported(
     cameras: list[Camera], error_px: float, focal_error: float, distance: float, seed: tuple[int, ...]
 ) -> list[Camera]:
-    """The cameras with independent errors of their poses and a common error of their focal lengths.
+    """Return the cameras with independent errors of their poses and a common error of their focal lengths.
 
-    Rotation and position err by normal distributions that move a point at `distance` in the middle of the image by
-    `error_px` pixels (root mean square of the distance), half of the variance each.
+    Errors of rotation and position are normally distributed. They move a point at `distance` in the middle of the image
+    by `error_px` pixels (root mean square of the distance); each contributes half of the variance.
 
     Args:
         error_px: root mean square distance in the image, pixels.
@@ -29,7 +29,7 @@ def reported(
     rng = np.random.default_rng(seed)
     told = []
     for camera in cameras:
-        # Of the three axes of a rotation, and of a shift, two move the middle of the image.
+        # Two of the three axes of a rotation, and of a translation, move the middle of the image.
         per_axis = error_px / 2.0
         angles = rng.standard_normal(3) * per_axis / camera.fx
         shift = rng.standard_normal(3) * per_axis * distance / camera.fx
@@ -42,7 +42,7 @@ def reported(
 
 
 def _rotation(vector: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation about a vector by its length in radians."""
+    """Return the (3, 3) rotation about a vector by its length in radians."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(vector).as_matrix()

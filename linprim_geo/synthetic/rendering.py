@@ -1,4 +1,4 @@
-"""Pictures of a synthetic capture: colours, depth, normals and coverage of a view, and their files."""
+"""Images of a synthetic capture: colours, depth, normals and coverage of a view, and their files."""
 
 from __future__ import annotations
 
@@ -18,24 +18,25 @@ from linprim_geo.synthetic.realism.scenes import TracedScene
 from linprim_geo.synthetic.textured import TexturedMesh
 
 Backdrop = Color | SyntheticEnvironment | TracedScene | None
-"""What stands behind the surface, or renders it and that; None is a transparent background."""
+"""The background: a colour, an environment, None for a transparent one; or a path tracer, which renders both surface
+and background."""
 
 NOISE_SEED = 6
-"""Tells the random numbers of the sensor noise from those of the gains (5) and of the path `arc` (7)."""
+"""Separates the random numbers of the sensor noise from those of the gains (5) and of the path `arc` (7)."""
 
 RAYS_AT_ONCE = 16_384
-"""Sub-pixel rays per step: the temporaries of one step (some 3 kB per ray at most) stay in cache."""
+"""Sub-pixel rays per step. Temporaries (at most some 3 kB per ray) then stay in cache."""
 
 AMBIENT = 0.42
 LIGHTS = (((0.5, -0.35, 0.8), 0.48), ((-0.7, 0.6, 0.1), 0.22))
-"""Light of `shaded`: ambient, and (direction towards the light, strength) of two lamps at infinity."""
+"""Light of `shaded`: ambient strength, and (direction towards the light, strength) of two lamps at infinity."""
 
 SHININESS = 12
-"""Phong's exponent of the highlights: wide enough for spherical harmonics of low degree to follow."""
+"""Phong's exponent of the highlights, low enough for spherical harmonics of low degree to represent them."""
 
 
 def render_views(renderer: Renderer, train: list[Camera], test: list[Camera], workers: int) -> list[float]:
-    """Renders all views into their files; returns the share of pixels of each that show the surface."""
+    """Render all views to their files; return the share of pixels of each that show the surface."""
     jobs = [("train", i, camera) for i, camera in enumerate(train)]
     jobs += [("test", i, camera) for i, camera in enumerate(test)]
     for split in {split for split, _, _ in jobs}:
@@ -43,13 +44,13 @@ def render_views(renderer: Renderer, train: list[Camera], test: list[Camera], wo
             (renderer.folder / kind / split).mkdir(parents=True, exist_ok=True)
     if isinstance(renderer.backdrop, TracedScene):
         renderer.backdrop.prepare()
-        workers = 1  # the path tracer uses all cores by itself
+        workers = 1  # the path tracer itself uses all cores
     with ThreadPoolExecutor(workers) as pool:
         return list(pool.map(lambda job: renderer.write(*job), jobs))
 
 
 class Renderer:
-    """Renders views and writes their files; `write` may run in several threads at once."""
+    """Renders views and writes their files. `write` is safe to call from several threads."""
 
     def __init__(
         self,
@@ -69,7 +70,7 @@ class Renderer:
         self.origin = surface.albedo_origin
 
     def write(self, split: str, number: int, camera: Camera) -> float:
-        """Renders one view into its files and returns the share of pixels that show the surface."""
+        """Render one view to its files and return the share of pixels that show the surface."""
         depth, face, normal = self.render_depth(camera)
         if isinstance(self.backdrop, TracedScene):
             color, alpha = self.backdrop.picture(camera, split, number), (face >= 0).astype(np.float32)
@@ -90,7 +91,7 @@ class Renderer:
         return float(hit.mean())
 
     def photograph(self, split: str, number: int, color: np.ndarray, alpha: np.ndarray) -> np.ndarray:
-        """(H, W, 3 or 4) uint8 of what `render` gives: behind it the background, gain and noise of the camera."""
+        """Return (H, W, 3 or 4) uint8 for the result of `render`, with the background, effects, gain and noise."""
         gain = self.gains[number].astype(np.float32) if split == "train" else np.ones(3, np.float32)
         seed = (self.options.seed, NOISE_SEED, int(split == "test"), number)
         if self.backdrop is None:
@@ -103,10 +104,10 @@ class Renderer:
         return to_bytes(sensor_noise(gain * color, self.options.noise, seed))
 
     def render(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied colour (H, W, 3) float32 and coverage (H, W) float32, the mean of supersample^2 rays.
+        """Return premultiplied colour (H, W, 3) float32 and coverage (H, W) float32, means of supersample^2 rays.
 
-        The colour is that of the surface; an environment is in it where rays miss the surface, a plain background
-        is not.
+        The colour is that of the surface. It includes an environment where rays miss the surface, but not a plain
+        background.
         """
         height, width, n = camera.height, camera.width, self.options.supersample
         color = np.zeros((height * width, 3), dtype=np.float32)
@@ -132,7 +133,7 @@ class Renderer:
         return (color * count).reshape(height, width, 3), (alpha * count).reshape(height, width)
 
     def render_depth(self, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`RayCaster.render_depth` through the lens."""
+        """Return the result of `RayCaster.render_depth`, with the lens distortion."""
         if not self.options.distortion:
             return self.caster.render_depth(camera)
         columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
@@ -145,7 +146,7 @@ class Renderer:
         return depth.reshape(shape), face.reshape(shape), normal.reshape(*shape, 3)
 
     def shade(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which rays (R, 3) hit, as indices (N,), and the colours (N, 3) float32 there."""
+        """Return the indices (N,) of the rays (R, 3) that hit, and the colours (N, 3) float32 there."""
         distance, face, bary = self.caster.cast_single(origin, rays)
         seen = np.flatnonzero(face >= 0)
         face, direction = face[seen], rays[seen]
@@ -154,7 +155,7 @@ class Renderer:
         return seen, self.light(color, face, direction)
 
     def light(self, color: np.ndarray, face: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """The colours (N, 3) as seen along `direction` (N, 3) under the lamps of the chosen shading."""
+        """Return the colours (N, 3) as seen along `direction` (N, 3) with the chosen shading."""
         shaded, specular = self.options.shading == "shaded", self.options.specular
         if not shaded and not specular:
             return color
@@ -177,7 +178,7 @@ class Renderer:
 
 
 def depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
-    """The smallest of 1, 2, 5 times a power of ten with which every depth of the scene fits 16 bits."""
+    """Return the smallest of 1, 2, 5 times a power of ten with which every depth of the scene fits in 16 bits."""
     corners = np.array(np.meshgrid(*np.stack([surface.vertices.min(0), surface.vertices.max(0)]).T)).reshape(3, -1).T
     farthest = max(float(camera.project(corners)[1].max()) for camera in cameras)
     exact = farthest / 65535.0
@@ -186,7 +187,7 @@ def depth_unit(surface: TexturedMesh, cameras: list[Camera]) -> float:
 
 
 def without_threads(caster: RayCaster) -> RayCaster:
-    """The same caster without threads of its own, to be called from many, with its own counter."""
+    """Return a copy of the caster that uses one thread, for calls from many threads, with a counter of its own."""
     single = object.__new__(RayCaster)
     single.__dict__.update(caster.__dict__)
     single.threads, single.recast = 1, 0

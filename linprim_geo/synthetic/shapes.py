@@ -1,5 +1,4 @@
-"""Scenes made by code, with exact surfaces and procedural colour: the truth of the tests, the demo and
-`synth`."""
+"""Scenes made by code, with exact surfaces and procedural colour: ground truth of tests, the demo and `synth`."""
 
 from __future__ import annotations
 
@@ -8,8 +7,8 @@ import numpy as np
 from linprim_geo.synthetic.textured import TexturedMesh, procedural_albedo
 
 SEGMENTS = 128
-"""Facets of a round hole or boss: its chords stay within 1 - cos(pi/128) = 0.03 % of the radius, under 0.006
-% of the diagonal of every shape here."""
+"""Facets of a round hole or boss: their chords deviate by 1 - cos(pi/128) = 0.03 % of the radius, below 0.006 % of the
+diagonal of every shape here."""
 
 
 # Colours of the parts of `furnished_room`.
@@ -35,23 +34,22 @@ ROOM_PALETTE = (
 
 
 def box(low, high):
-    """A solid box between two corners."""
+    """Return a solid box between two corners."""
     from manifold3d import Manifold
 
     return Manifold.cube(np.subtract(high, low)).translate(low)
 
 
 def _drum(radius, height, at, top=-1.0):
-    """A cylinder, or a cone that ends with the radius `top`."""
+    """Return a cylinder, or a cone that ends with the radius `top`."""
     from manifold3d import Manifold
 
     return Manifold.cylinder(height, radius, top, SEGMENTS).translate(at)
 
 
 def cad_part(detail: float = 1.0) -> TexturedMesh:
-    """A machined part, closed: a chamfered plate with counterbored holes, a slot and pockets, a bearing block
-    with a grooved bore, thin ribs, a thin fence with windows, and a stud with a hexagonal socket. Diagonal
-    2."""
+    """Return a closed machined part: a chamfered plate with counterbored holes, a slot and pockets, a bearing block
+    with a grooved bore, thin ribs, a thin fence with windows, and a stud with a hexagonal socket. Diagonal 2."""
     from manifold3d import CrossSection, Manifold
 
     tags = Tags()
@@ -96,17 +94,17 @@ def cad_part(detail: float = 1.0) -> TexturedMesh:
 
 
 def smooth_body(detail: float = 1.0, resolution: int = 128) -> TexturedMesh:
-    """A smooth closed body of genus 1, blended from a ring, balls and an arm, without an edge. Diagonal 2.
+    """Return a smooth closed body of genus 1 without edges, blended from a ring, balls and an arm. Diagonal 2.
 
-    Marching cubes of a smooth field at `resolution` cells along the longest side, vertices moved onto the
-    level set by Newton steps: they lie on it to 1e-9, the facets to 0.02 % of the diagonal.
+    Computed by marching cubes of a smooth field with `resolution` cells along the longest side, and Newton steps that
+    move vertices to the level set. Vertices are accurate to 1e-9, facets to 0.02 % of the diagonal.
     """
     vertices, faces = _body_surface(resolution)
     return _finish("smooth_body", vertices, faces, np.zeros(len(faces), np.int32), detail=detail, seed=2)
 
 
 def _body_surface(resolution: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the zero level of `_body_field`, in its own frame, outward."""
+    """Return vertices and faces of the zero level of `_body_field`, in its own frame, oriented outwards."""
     from igl import marching_cubes
 
     lower, upper = np.array([-1.25, -1.0, -0.85]), np.array([1.3, 1.0, 1.15])
@@ -123,9 +121,9 @@ def _body_surface(resolution: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _body_field(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Value (N,) and gradient (N, 3) of the body's field, negative inside.
+    """Return value (N,) and gradient (N, 3) of the body's field, negative inside.
 
-    The soft minimum -log(sum exp(-k d)) / k of distances to a tilted ring and to balls.
+    It is the soft minimum -log(sum exp(-k d)) / k of distances to a tilted ring and to balls.
     """
     k = 5.0
     tilt = np.array([[1.0, 0.0, 0.0], [0.0, 0.8, -0.6], [0.0, 0.6, 0.8]])
@@ -153,11 +151,11 @@ def _body_field(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def furnished_room(detail: float = 1.0, seed: int = 5) -> TexturedMesh:
-    """A room of 6 x 5 x 2.7 m seen from inside: one closed surface whose faces look into the air.
+    """Return a room of 6 x 5 x 2.7 m seen from inside: one closed surface with faces towards the inside.
 
-    Table with things on it, chairs, shelf with books, sofa, wardrobe, lamps on thin rods, pictures, window
-    and door recesses. In metres, z up, floor at z = 0. It is the boundary of the air, so nothing hidden is
-    part of it.
+    It has a table with things on it, chairs, a bookshelf, a sofa, a wardrobe, lamps on thin rods, pictures, window
+    and door recesses. Units are metres; z is up, the floor at z = 0. The surface is the boundary of the air, so it has
+    no hidden parts.
     """
     from manifold3d import Manifold
 
@@ -197,7 +195,7 @@ def _add_table_and_chairs(add) -> None:
 
 
 def _add_shelf(add, things: list, rng: np.random.Generator) -> None:
-    """With books whose colours follow the number of `things` before them."""
+    """Add a shelf with books; their colours depend on the number of `things` before them."""
     for y in (0.9, 2.92):
         add(box((5.66, y, -0.1), (6.1, y + 0.03, 1.95)), 5)
     heights = (0.08, 0.46, 0.84, 1.22, 1.6, 1.92)
@@ -236,7 +234,7 @@ def _add_sofa(add) -> None:
 
 
 def _add_other_things(add) -> None:
-    """Wardrobe, lamps, balls, dishes, pictures, a rug and a beam."""
+    """Add a wardrobe, lamps, balls, dishes, pictures, a rug and a beam."""
     from manifold3d import CrossSection, Manifold
 
     add(box((-0.1, -0.1, -0.1), (0.62, 1.25, 2.1)), 12)
@@ -260,9 +258,8 @@ def _add_other_things(add) -> None:
 
 
 def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
-    """Thin structures and an open surface: a frame of rods, a coil, a knot and straight wires of 0.4 to 1 %
-    of the diagonal in radius (closed), and a curved sheet without thickness (a surface with a boundary).
-    Diagonal 2."""
+    """Return thin structures and an open surface: a frame of rods, a coil, a knot and straight wires with radii of 0.4
+    to 1 % of the diagonal (closed), and a curved sheet without thickness (a surface with a boundary). Diagonal 2."""
     from manifold3d import Manifold
 
     tags = Tags()
@@ -299,19 +296,19 @@ def wire_and_sheet(detail: float = 1.0) -> TexturedMesh:
 
 
 class Tags:
-    """Remembers which piece every solid is, through any number of booleans, by manifold's original ids."""
+    """Tracks the piece of every solid through boolean operations, by manifold's original ids."""
 
     def __init__(self) -> None:
         self.part_of_id: dict[int, int] = {}
 
     def tag(self, solid, part: int):
-        """The solid with an id of its own, which is remembered as piece `part`."""
+        """Return the solid with a new id, registered as piece `part`."""
         solid = solid.as_original()
         self.part_of_id[solid.original_id()] = part
         return solid
 
     def triangles(self, solid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices (V, 3), faces (F, 3) and the piece (F,) of every face."""
+        """Return vertices (V, 3), faces (F, 3) and the piece (F,) of every face."""
         from manifold3d import Error
 
         assert solid.status() == Error.NoError, solid.status()
@@ -324,7 +321,8 @@ class Tags:
         return np.array(mesh.vert_properties[:, :3], dtype=np.float64), faces, part
 
     def from_inside(self, air) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `triangles`, of a solid of air whose faces look into it; of piece 0 floors become 1 and ceilings 2."""
+        """Return the same as `triangles` for a solid of air, with faces towards the inside. Floors of piece 0 become
+        piece 1, its ceilings piece 2."""
         vertices, faces, part = self.triangles(air)
         faces = faces[:, ::-1]
         corner = vertices[faces]
@@ -337,14 +335,14 @@ class Tags:
 
 
 def operation(name: str):
-    """manifold3d's boolean operation "Add", "Subtract" or "Intersect"."""
+    """Return manifold3d's boolean operation "Add", "Subtract" or "Intersect"."""
     from manifold3d import OpType
 
     return getattr(OpType, name)
 
 
 def _finish(name, vertices, faces, part, *, detail: float, seed: int) -> TexturedMesh:
-    """Centred, with diagonal 2, and coloured."""
+    """Return the mesh centred, scaled to diagonal 2, and coloured."""
     lower, upper = vertices.min(0), vertices.max(0)
     vertices = (vertices - 0.5 * (lower + upper)) * (2.0 / np.linalg.norm(upper - lower))
     albedo = procedural_albedo(part, detail=detail, seed=seed)
@@ -357,7 +355,7 @@ def _volume(vertices: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _tube(path, radius: float, *, closed: bool = False, segments: int = 24):
-    """A solid of round cross-section along a polyline, by a frame carried along without twist."""
+    """Return a solid of round cross-section along a polyline, with rotation-minimizing frames."""
     from manifold3d import Manifold, Mesh64
 
     path = np.asarray(path, dtype=np.float64)
@@ -382,7 +380,7 @@ def _tube(path, radius: float, *, closed: bool = False, segments: int = 24):
     j = np.arange(segments)[None, :]
     k = (j + 1) % segments
     if closed:
-        # The carried frame comes back turned; join the last ring to the first at the nearest vertex.
+        # The transported frame returns rotated, so the last ring is joined to the first at the nearest vertex.
         shift = int(np.argmin(np.linalg.norm(ring[0] - ring[-1, 0], axis=1)))
         last = rings == count - 1
         jn, kn = np.where(last, (j + shift) % segments, j), np.where(last, (k + shift) % segments, k)

@@ -1,5 +1,4 @@
-"""Synthetic captures: posed images, depth, normals, masks and SfM-like points of a mesh whose surface is
-known."""
+"""Synthetic captures: posed images, depth, normals, masks and SfM-like points of a mesh with a known surface."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ from linprim_geo.synthetic.tabletop import on_table
 from linprim_geo.synthetic.textured import TexturedMesh, load_textured
 
 REFINE = 0.01
-"""Edges of reference.ply in units of the diagonal: its vertices carry the colours."""
+"""Longest edges of reference.ply, in units of the diagonal; its vertices carry the colours."""
 
 
 def synthesize(
@@ -50,36 +49,36 @@ def synthesize(
     overwrite: bool = False,
     **changes: Any,
 ) -> dict:
-    """Renders a capture of a built-in scene or of a mesh into the folder `out`, with the truth next to it.
+    """Render a capture of a built-in scene or of a mesh to the folder `out`, with ground truth.
 
-    Written: `train/000.png ...` and `test/`; `depth/`, `normal/` and `masks/` with the same two folders in
+    Files: `train/000.png ...` and `test/`; `depth/`, `normal/` and `masks/` with the same two folders in
     each; `transforms_train.json` and `transforms_test.json` (nerfstudio's keys, OpenGL camera-to-world);
     `sparse/0`, a COLMAP model of the training views and the points with their observations (image names
     relative to `out`); `points3D.ply`; `reference.ply`, the surface with vertex colours; `synth.json`, all
-    parameters. The frame and unit are the mesh's own; of a path-traced scene, metres. If cameras are reported with
+    parameters. Frame and unit are the mesh's own; metres for a path-traced scene. If cameras are written with
     errors, `truth_cameras.json` has the true ones.
 
     Images are the mean of supersample^2 rays per pixel, in the stored (sRGB) values. Depth is along the
     optical axis, exactly at the pixel centre, rounded to `depth_unit_scale_factor` (at most 1/30000 of the
-    largest depth) as uint16, 0 for nothing; or float32 as `.npy`. Normals are geometric, in the world's axes,
-    towards the camera, (n + 1) / 2 in 8 bits, black for nothing. Masks are the coverage in 8 bits, the
-    images' alpha; with an opaque background or an environment the images hold it already, and the coverage is
-    in `truth_masks/` so that nobody applies it a second time.
+    largest depth) as uint16, 0 for no surface; or float32 as `.npy`. Normals are geometric, in world axes,
+    towards the camera, (n + 1) / 2 in 8 bits, black for no surface. Masks are the coverage in 8 bits, equal to the
+    images' alpha. With an opaque background or an environment, the images already include it, and the coverage is
+    in `truth_masks/`, so that it is not applied twice.
 
     Args:
-        out: folder to make; it must not exist or be empty. Everything is written to a temporary folder beside
-            it that is renamed at the end.
-        options: how it is photographed.
-        shape: `cad`, `smooth`, `room`, `wires` or `hall`. One of `shape` and `mesh`; neither is `cad`.
+        out: folder to create; it must be empty or not exist. Everything is written to a temporary folder beside
+            it, which is renamed at the end.
+        options: the settings of the photographs.
+        shape: `cad`, `smooth`, `room`, `wires` or `hall`. Give `shape` or `mesh`, not both; the default is `cad`.
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
         overwrite: replace `out` if it was made by `synth` before.
         changes: fields of `options` by name, such as `views=16`.
 
     Returns:
-        What was made: folder, counts, size, seconds.
+        Folder, counts, size and seconds.
 
     Raises:
-        LinprimError: an option has no meaning, the mesh cannot be read, `out` is not empty or cannot be
+        LinprimError: an option is invalid, the mesh cannot be read, `out` is not empty or cannot be
         written.
     """
     start = time.perf_counter()
@@ -102,7 +101,7 @@ def synthesize(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What is photographed, from where: all that is known before anything is rendered or written."""
+    """The surface, the cameras and all other settings that are fixed before anything is rendered or written."""
 
     surface: TexturedMesh
     caster: RayCaster
@@ -142,7 +141,7 @@ def _plan(shape, mesh, options: SynthOptions) -> _Plan:
 
 
 def _write_capture(plan: _Plan, options: SynthOptions, folder: Path) -> dict:
-    """All files of the capture but `synth.json`, whose entries are returned."""
+    """Write all files of the capture except `synth.json`, and return the entries of that."""
     surface, caster, train, test = plan.surface, plan.caster, plan.train, plan.test
     unit = depth_unit(surface, train + test) if options.depth_format == "png" else 1.0
     single = without_threads(caster)
@@ -179,7 +178,7 @@ def _write_capture(plan: _Plan, options: SynthOptions, folder: Path) -> dict:
 
 
 def _told(plan: _Plan, options: SynthOptions) -> dict[str, list[Camera]]:
-    """The training and held-out cameras as they are written: the true ones, or with errors."""
+    """Return the training and held-out cameras as they are written: the true ones, or ones with errors."""
     true = {"train": plan.train, "test": plan.test}
     if not (options.pose_error or options.focal_error):
         return true
@@ -192,7 +191,7 @@ def _told(plan: _Plan, options: SynthOptions) -> dict[str, list[Camera]]:
 
 
 def _cloud(plan: _Plan, options: SynthOptions, renderer: Renderer, told: list[Camera], folder: Path) -> ObservedPoints:
-    """The points that go with the photographs in `folder`."""
+    """Return the points of the capture whose photographs are in `folder`."""
     photos = [folder / photo_name("train", number, options.jpeg) for number in range(len(told))]
     if options.points_from == "photographs":
         return photographed_points(told, photos, options.seed, plan.workers)
@@ -211,7 +210,7 @@ def _cloud(plan: _Plan, options: SynthOptions, renderer: Renderer, told: list[Ca
     return photographed_colors(cloud, photos) if traced else cloud
 
 
-# What was asked for
+# --- options ---
 
 
 def _surface(shape, mesh, detail) -> TexturedMesh:
@@ -227,7 +226,7 @@ def _surface(shape, mesh, detail) -> TexturedMesh:
 
 
 def _backdrop(options: SynthOptions, inside: bool) -> Backdrop:
-    """What stands behind the surface: an environment, a colour, or nothing (None, transparent)."""
+    """Return the background: an environment, a colour, or None for a transparent one."""
     if options.environment is not None:
         return synthetic_environment(options.environment)
     if options.background is None:
@@ -236,7 +235,7 @@ def _backdrop(options: SynthOptions, inside: bool) -> Backdrop:
 
 
 def _described(options: SynthOptions, path: str, backdrop: Backdrop, gains: np.ndarray) -> dict:
-    """The options as `synth.json` records them, with what was chosen where nothing was said."""
+    """Return the options as `synth.json` records them, with the chosen values in place of unset ones."""
     settings = {name: value for name, value in asdict(options).items() if name not in ("size", "fov", "threads")}
     width, height = options.width_height
     named = "transparent" if backdrop is None else "scene" if isinstance(backdrop, TracedScene) else "environment"
@@ -254,17 +253,17 @@ def _described(options: SynthOptions, path: str, backdrop: Backdrop, gains: np.n
 
 
 def _gains(options: SynthOptions) -> np.ndarray:
-    """(views, 3) gains of the training photographs, of geometric mean 1 per channel."""
+    """Return (views, 3) gains of the training photographs, of geometric mean 1 per channel."""
     rng = np.random.default_rng([options.seed, 5])
     log = rng.uniform(-1.0, 1.0, (options.views, 1)) + 0.25 * rng.uniform(-1.0, 1.0, (options.views, 3))
     return np.exp(options.exposure_drift * (log - log.mean(0)))
 
 
-# Files
+# --- files ---
 
 
 def _write_reference(path: Path, plan: _Plan) -> None:
-    """The surface; of a path-traced scene what the training views see of it."""
+    """Write the surface; of a path-traced scene, only the part that training views see."""
     from linprim_geo.geometry.mesh import Mesh
     from linprim_geo.geometry.mesh_files import save_mesh
 

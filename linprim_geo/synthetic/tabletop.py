@@ -1,4 +1,4 @@
-"""An object on a wooden table: the slab, its wood, both as one surface."""
+"""An object on a wooden table, as one surface: the slab and its wood texture."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.synthetic.textured import POINTS_AT_ONCE, Albedo, TexturedMesh
 
 THICKNESS = 0.04
-"""Of the slab, in units of its side."""
+"""Thickness of the slab, in units of its side."""
 
 PLANK = 0.32
-"""Width of a plank in units of the object's horizontal diameter, or of half its diagonal if that is longer;
-rounded so that whole planks make the slab."""
+"""Width of a plank in units of the object's horizontal diameter, or of half its diagonal if that is longer. It is
+rounded so that the slab has whole planks."""
 
 GRAIN_ACROSS = (0.07, 0.2)
 GRAIN_ALONG = (1.0, 3.0)
 DRIFT = (0.4, 1.2)
-"""Shortest and longest wavelengths of the wood, in units of half the object's diagonal: grain across and along
-the planks, and the broad drift of brightness. The shortest is some nine pixels where the object fills 300."""
+"""Shortest and longest wavelengths of the wood, in units of half the object's diagonal: grain across and along the
+planks, and the broad drift of brightness. The shortest is some nine pixels where the object fills 300."""
 
 SEAM = 0.04
-"""Half the width of the dark seam between planks, in the same unit: from the middle to full colour."""
+"""Half width of the dark seam between planks, in the same unit: from its middle to full colour."""
 
 WARP = 0.6
-"""Radians by which one standard deviation of the drift bends the grain."""
+"""Phase shift of the grain per standard deviation of the drift, radians; it bends the grain."""
 
 KNOTS_APART = 1.1
 KNOT = (0.028, 0.055)
-"""Distance of the knots of a plank along it, and their smallest and largest radius, in the same unit."""
+"""Spacing of the knots along a plank, and their smallest and largest radius, in the same unit."""
 
 WOOD_COLOR = (0.50, 0.355, 0.265)
 GRAIN_TINT = (0.045, 0.041, 0.036)
-"""sRGB of the wood, and how far one standard deviation of the grain changes it."""
+"""sRGB of the wood, and its change per standard deviation of the grain."""
 
 WAVES = {"grain": 16, "drift": 6}
 
 
 def on_table(surface: TexturedMesh, width: float, seed: int = 0) -> TexturedMesh:
-    """The surface on a square slab of wood as one surface, in the surface's own frame; z is up.
+    """Return the surface on a square wooden slab, as one surface in the surface's own frame; z is up.
 
     The slab's side is `width` times the larger horizontal extent of the surface's bounding box, its thickness
-    THICKNESS of that; it is centred under the surface, and its top is exactly at the surface's lowest z. The
-    surface's vertices, faces and colours are unchanged and come first; the slab is the last part.
+    THICKNESS of that. It is centred under the surface, with its top exactly at the surface's lowest z. The surface's
+    vertices, faces and colours are unchanged and come first; the slab is the last part.
 
     Args:
         seed: of the wood.
@@ -73,7 +73,8 @@ def on_table(surface: TexturedMesh, width: float, seed: int = 0) -> TexturedMesh
 
 
 def slab(top: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (8, 3) and outward faces (12, 3) of a square slab whose upper face has its middle at `top` (3,)."""
+    """Return vertices (8, 3) and outward faces (12, 3) of a square slab; its upper face has its centre at `top`
+    (3,)."""
     half = 0.5 * side
     square = np.array([[-half, -half], [half, -half], [half, half], [-half, half]]) + top[:2]
     heights = (top[2] - THICKNESS * side, top[2])
@@ -86,7 +87,7 @@ def slab(top: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class TabletopAlbedo:
-    """The colours of an object on the first `object_faces` faces and those of a table on the others."""
+    """Colours of an object on the first `object_faces` faces, and of a table on the others."""
 
     object: Albedo
     table: Albedo
@@ -103,14 +104,14 @@ class TabletopAlbedo:
 
 @dataclass(frozen=True)
 class WoodAlbedo:
-    """Planks along x with grain and knots, a solid texture: its sides have it, too.
+    """Wood as a solid texture, so that the sides have it too: planks along x with grain and knots.
 
-    Every term is smooth. What differs from plank to plank (brightness, phase of the grain) fades to nothing at
-    the seams, so that the colour is continuous there; the drift does not, so that seams have gradients, too.
+    Every term is smooth. Terms that differ between planks (brightness, phase of the grain) fade out at the seams, so
+    that the colour is continuous there. The drift does not, so that seams have gradients too.
 
-    `middle` (3,) of the slab's top, `side` of the slab, `unit` the length that wavelengths are counted in;
-    grain (3, G) and drift (3, D) wave vectors, drift_phase (D,); per plank brightness (P,) and grain_phase
-    (P, G); knots (P, C, 3): place along the plank within its cell, place across, radius.
+    `middle` (3,) of the slab's top, `side` of the slab, `unit` of the wavelengths. grain (3, G) and drift (3, D) are
+    wave vectors, with drift_phase (D,). Per plank: brightness (P,), grain_phase (P, G), and knots (P, C, 3): position
+    along the plank within its cell, position across, radius.
     """
 
     middle: np.ndarray
@@ -136,14 +137,14 @@ class WoodAlbedo:
         width = np.float32(self.side / planks)
         across = points[:, 1] / width + np.float32(0.5 * planks)
         plank = np.clip(np.floor(across), 0, planks - 1).astype(np.int64)
-        # From the nearest edge of the plank, in units of the seam's half width.
+        # Distance to the nearest edge of the plank, in units of the seam's half width.
         edge = np.minimum(across - plank, 1.0 + plank - across) * width / np.float32(SEAM * self.unit)
         open_wood = np.clip(edge, 0.0, 1.0)
         open_wood = open_wood * open_wood * (np.float32(3.0) - 2.0 * open_wood)
         drift = np.sin(points @ self.drift + self.drift_phase).sum(1) * np.float32(np.sqrt(2.0 / len(self.drift_phase)))
         waves = np.sin(points @ self.grain + self.grain_phase[plank] + np.float32(WARP) * drift[:, None])
         grain = waves.sum(1) * np.float32(np.sqrt(2.0 / self.grain.shape[1]))
-        # The soft threshold of the built-in textures: streaks with flat tops.
+        # The soft threshold of the built-in textures gives streaks with flat tops.
         grain = np.float32(1.6) * grain / np.sqrt(1.0 + grain * grain)
         light = np.float32(0.04) * drift + open_wood * self.brightness[plank] - np.float32(0.3) * (1.0 - open_wood)
         light -= np.float32(0.4) * open_wood * self._knots(points, across - plank, plank, width)
@@ -152,23 +153,23 @@ class WoodAlbedo:
         return np.clip(color, 0.02, 0.98)
 
     def _knots(self, points: np.ndarray, across: np.ndarray, plank: np.ndarray, width: np.float32) -> np.ndarray:
-        """(N,) darkness of the knots, 1 at their middle: each is an upright rod through the slab."""
+        """Return (N,) darkness of the knots, 1 at their middle. Each is a vertical rod through the slab."""
         cells = self.knots.shape[1]
         length = np.float32(self.side / cells)
         along = points[:, 0] / length + np.float32(0.5 * cells)
         cell = np.clip(np.floor(along), 0, cells - 1).astype(np.int64)
         x, y, radius = self.knots[plank, cell].T
-        # Twice as long along the grain as across; (1 - r^2)^2 is smooth and ends at r = 1.
+        # Knots are twice as long along the grain as across. (1 - r^2)^2 is smooth and ends at r = 1.
         squared = ((along - cell - x) * length / (2.0 * radius)) ** 2 + ((across - y) * width / radius) ** 2
         return np.maximum(np.float32(1.0) - squared, 0.0) ** 2
 
 
 def wood_albedo(middle: np.ndarray, side: float, planks: int, unit: float, seed: int) -> WoodAlbedo:
-    """Wood of `planks` planks on a slab of `side`, whose top has its middle at `middle` (3,) from the origin of the
-    points; wavelengths are in `unit`."""
+    """Return wood of `planks` planks on a slab of `side`; the centre of its top is at `middle` (3,), relative to the
+    origin of the points; wavelengths are in `unit`."""
     rng = np.random.default_rng([seed, 8])
     cells = max(1, round(side / (KNOTS_APART * unit)))
-    # Shorter waves of the grain are as many as longer ones: lengths are spread over their logarithm.
+    # Wavelengths across are evenly spaced in their logarithm, so short and long ones are equally frequent.
     low, high = np.log(GRAIN_ACROSS)
     short = unit * np.exp(np.linspace(low, high, WAVES["grain"]))
     long = unit * rng.uniform(*GRAIN_ALONG, WAVES["grain"]) * rng.choice([-1.0, 1.0], WAVES["grain"])

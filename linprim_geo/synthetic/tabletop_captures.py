@@ -1,4 +1,4 @@
-"""Three captures of an object on a table before a far room, made by code."""
+"""Three captures, made by code, of an object on a table in front of a distant room."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ TABLETOPS: dict[str, dict] = {
         "seed": 3,
     },
 }
-"""Arguments of `synth.synthesize` by name; `mesh` is the stem of a file, `up` the axis of its coordinates that is
-to point upwards (default z). With the noise of the points their mean reprojection error is half a pixel."""
+"""Arguments of `synth.synthesize` by name; `mesh` is the stem of a file, `up` the axis of its coordinates that becomes
+the vertical one (default z). The noise of the points gives a mean reprojection error of half a pixel."""
 
 ALL_TABLETOPS = {
     "test_views": 8,
@@ -56,18 +56,18 @@ ALL_TABLETOPS = {
     "points": 1500,
     "shading": "shaded",
 }
-"""What the named captures have in common."""
+"""Arguments shared by these captures."""
 
 
 def tabletop(name: str, out: str | os.PathLike, meshes: str | os.PathLike, **changes) -> dict:
-    """Makes the capture `name` of `TABLETOPS` in the folder `out`; returns the report of `synth.synthesize`.
+    """Make the capture `name` of `TABLETOPS` in the folder `out`; return the report of `synth.synthesize`.
 
     Args:
         meshes: folder with the mesh as .glb, .obj or .ply.
-        changes: arguments of `synthesize` that take the place of the named ones.
+        changes: arguments of `synthesize` that override the named ones.
 
     Raises:
-        LinprimError: no such name, no such mesh, or what `synthesize` refuses.
+        LinprimError: the name or the mesh does not exist, or `synthesize` rejects an argument.
     """
     from linprim_geo.synthetic.synth import synthesize
 
@@ -81,6 +81,6 @@ def tabletop(name: str, out: str | os.PathLike, meshes: str | os.PathLike, **cha
         raise LinprimError(f"{meshes}: holds no {stem}.glb, .obj or .ply")
     surface = load_textured(found[0])
     if up == "y":
-        # A quarter turn about x: (x, y, z) becomes (x, -z, y).
+        # A quarter turn about x maps (x, y, z) to (x, -z, y).
         surface = replace(surface, vertices=surface.vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0))
     return synthesize(out, mesh=surface, **settings)

@@ -1,4 +1,4 @@
-"""A surface with a colour at every point: procedural, or the texture or vertex colours of a mesh file."""
+"""Surfaces with a colour at every point: procedural, or from the texture or vertex colours of a mesh file."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Albedo = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 [0, 1]."""
 
 POINTS_AT_ONCE = 1024
-"""Small enough that the matrix products stay below the size at which OpenBLAS starts threads of its own,
-which would fight with those that render."""
+"""Points per step. Matrix products then stay below the size from which on OpenBLAS starts threads of its own, which
+would compete with those that render."""
 
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """A triangle mesh and its colour as a function of the surface point.
+    """A triangle mesh with its colour as a function of the surface point.
 
-    `vertices` (V, 3) float64, `faces` (F, 3) int64, `part` (F,) int32 says which piece a face belongs to,
-    `albedo` gives colours (see `Albedo`), `path` is the camera path that suits it, `unit` the unit of length,
-    `origin` (3,) the point from which the albedo counts its points, by default the middle of the bounding box.
+    `vertices` (V, 3) float64, `faces` (F, 3) int64, `part` (F,) int32 the piece of each face, `albedo` the colours (see
+    `Albedo`), `path` the default camera path, `unit` the unit of length, `origin` (3,) the origin of the points passed
+    to the albedo, by default the centre of the bounding box.
     """
 
     name: str
@@ -43,12 +43,12 @@ class TexturedMesh:
 
     @property
     def albedo_origin(self) -> np.ndarray:
-        """(3,) the point that the albedo's points are relative to."""
+        """(3,) origin of the points passed to the albedo."""
         return self.center if self.origin is None else self.origin
 
     @property
     def center(self) -> np.ndarray:
-        """(3,) middle of the bounding box."""
+        """(3,) centre of the bounding box."""
         return 0.5 * (self.vertices.min(0) + self.vertices.max(0))
 
     @property
@@ -58,19 +58,19 @@ class TexturedMesh:
 
     @property
     def used_vertices(self) -> np.ndarray:
-        """(U, 3) the vertices of faces; a file may hold others."""
+        """(U, 3) vertices used by faces; a file may contain others."""
         return self.vertices[np.unique(self.faces)]
 
     def colors(self, points: np.ndarray, face: np.ndarray, bary: np.ndarray) -> np.ndarray:
-        """(N, 3) float32 albedo at surface points (N, 3) of the mesh's own frame."""
+        """Return (N, 3) float32 albedo at surface points (N, 3) in the mesh's own frame."""
         return self.albedo((points - self.albedo_origin).astype(np.float32), face, bary)
 
     def refined(self, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices, faces and (V, 3) uint8 vertex colours of the same surface with edges up to about
+        """Return vertices, faces and (V, 3) uint8 vertex colours of the same surface with edges up to about
         `max_edge`.
 
         The surface and its topology are unchanged; edges inside a former face may be up to 2.5 times as long.
-        A vertex on the seam between pieces takes the colour of one of them.
+        A vertex on the seam between pieces gets the colour of one of them.
         """
         vertices, faces, origin = refine(self.vertices, self.faces, max_edge)
         face_of_vertex = np.zeros(len(vertices), dtype=np.int64)
@@ -82,16 +82,14 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class ProceduralAlbedo:
-    """Colour as sums of plane waves: a broad drift of hue, soft bands, blotches and a fine grain, per piece
-    tinted.
+    """A colour that is a sum of plane waves: a broad drift of hue, soft bands, blotches and a fine grain, tinted by
+    piece.
 
     Every term is a smooth function of the point, so the shortest wavelength is known and photographs are not
-    aliased; none is constant along any direction, so that every patch of a surface has gradients to be
-    matched by.
+    aliased. No term is constant along any direction, so every patch of a surface has gradients to match.
 
-    base (P, 3) and tint (P, 3) colours per piece; waves (3, K), phase (K,), and mix (K, 7) which sums the
-    waves into drift (3), grain (3) and the argument of the blotches (1); band (3,), the wave vector of the
-    bands.
+    base (P, 3) and tint (P, 3) are colours per piece. waves (3, K) are wave vectors with phase (K,); mix (K, 7) sums
+    the waves to drift (3), grain (3) and the argument of the blotches (1). band (3,) is the wave vector of the bands.
     """
 
     part: np.ndarray
@@ -133,7 +131,7 @@ def procedural_albedo(
     seed: int = 0,
     palette: Sequence | None = None,
 ) -> ProceduralAlbedo:
-    """The standard colouring of the shapes here.
+    """Return the standard procedural colours of the built-in shapes.
 
     Args:
         part: (F,) piece of each face.
@@ -159,7 +157,7 @@ def procedural_albedo(
     lengths = {"drift": (0.7, 1.6), "blotch": (0.2, 0.32), "grain": (0.055, 0.09)}
     waves, mixes = [], []
     for kind, count in counts.items():
-        # Evenly spread over the half-sphere, then turned at random: no direction prevails.
+        # Directions evenly spread over the half-sphere, randomly rotated, so that none prevails.
         z = (np.arange(count) + 0.5) / count
         turn = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
         direction = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
@@ -190,9 +188,9 @@ def procedural_albedo(
 
 
 def subdivide(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Splits edges longer than `max_edge` at their middle until none is left.
+    """Split edges longer than `max_edge` at their midpoints until none is left.
 
-    Returns vertices, faces and the input face (F,) that each face is a part of. No cracks: an edge is split
+    Returns vertices, faces and the input face (F,) that contains each face. There are no cracks: an edge is split
     for all its faces or for none. The surface does not change.
     """
     vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
@@ -210,7 +208,7 @@ def subdivide(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple
         mid = middle[inverse].reshape(-1, 3)
         split = mid >= 0
         count = split.sum(axis=1)
-        # Turn every face so that its split edges come first: one -> edge 0; two -> edges 0 and 1.
+        # Rotate the corners of every face so that its split edges come first: one -> edge 0; two -> edges 0 and 1.
         turn = np.where(count == 1, np.argmax(split, axis=1), (np.argmin(split, axis=1) + 1) % 3)
         order = (turn[:, None] + np.arange(3)) % 3
         face, m = np.take_along_axis(faces, order, 1), np.take_along_axis(mid, order, 1)
@@ -231,9 +229,9 @@ def subdivide(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple
 
 
 def refine(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Subdivides a mesh without moving its surface: closed pieces by manifold3d, open ones by `subdivide`.
+    """Subdivide a mesh without moving its surface: closed pieces by manifold3d, open ones by `subdivide`.
 
-    Returns vertices, faces and the input face (F,) that each face is a part of.
+    Returns vertices, faces and the input face (F,) that contains each face.
     """
     from manifold3d import Error, Manifold, Mesh64
     from scipy.sparse import coo_matrix
@@ -276,8 +274,8 @@ def refine(vertices: np.ndarray, faces: np.ndarray, max_edge: float) -> tuple[np
 
 @dataclass(frozen=True)
 class PieceColors:
-    """Colour of one piece of a file: an image (H, W, 3) float32 with (F, 3, 2) uv, or (F, 3, 3) corner
-    colours."""
+    """The colours of one piece of a file: an image (H, W, 3) float32 with (F, 3, 2) texture coordinates, or (F, 3, 3)
+    corner colours. `first` is the number of its first face."""
 
     first: int
     image: np.ndarray | None
@@ -304,19 +302,19 @@ class FileAlbedo:
 
 
 def _bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Samples (H, W, 3) at uv with v up from the lower edge, texel centres at half-integers, repeating."""
+    """Sample an image (H, W, 3) at uv: v up from the lower edge, texel centres at half-integers, repeating."""
     height, width = image.shape[:2]
     return sample_bilinear(image, np.stack([uv[:, 0] * width, (1.0 - uv[:, 1]) * height], axis=-1), repeat=True)
 
 
 def load_textured(path: str | Path, *, detail: float = 1.0) -> TexturedMesh:
-    """Reads a mesh with its texture or vertex colours: GLB, OBJ, PLY and whatever else trimesh reads.
+    """Read a mesh with its texture or vertex colours: GLB, OBJ, PLY and other formats of trimesh.
 
-    A piece without colours is given one flat colour of its material; a file without any colour gets the
-    procedural colours of the built-in shapes, scaled to its size.
+    A piece without colours gets the flat colour of its material; a file without any colours gets the procedural
+    colours of the built-in shapes, scaled to its size.
 
     Raises:
-        LinprimError: missing or unreadable, no triangles, coordinates that are not finite.
+        LinprimError: the file is missing or unreadable, has no triangles, or coordinates that are not finite.
     """
     import trimesh
 
@@ -358,7 +356,7 @@ def load_textured(path: str | Path, *, detail: float = 1.0) -> TexturedMesh:
 
 
 def _material(mesh, first: int) -> tuple[PieceColors, bool]:
-    """The colours of a trimesh mesh whose faces start at number `first`, and whether the file had any."""
+    """Return the colours of a trimesh mesh whose faces start at number `first`, and whether the file had any."""
     visual = mesh.visual
     uv = getattr(visual, "uv", None)
     material = getattr(visual, "material", None)

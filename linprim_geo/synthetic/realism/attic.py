@@ -1,7 +1,7 @@
 """A furnished room under a roof: slopes of two pitches, a dormer, a roof window, a skewed gable, a free chimney.
 
 The ridge runs along x, the straight gable is the plane x = 0, the floor z = 0. Slope A rises from the knee wall at
-y = 0, slope B from that at y = WIDTH. Nearly everything of the house itself is painted in the same white.
+y = 0, slope B from that at y = WIDTH. Nearly all walls and slopes have the same white paint.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from linprim_geo.synthetic.realism.render import Light, Stage
 from linprim_geo.synthetic.textured import TexturedMesh
 
 WIDTH, HEIGHT, KNEE_A, KNEE_B, PITCH_A, PITCH_B = 4.1, 2.35, 0.9, 0.6, 38.0, 52.0
-"""From knee wall to knee wall, of the flat ceiling and the knee walls, metres; of the slopes, degrees."""
+"""Distance between the knee walls, heights of the flat ceiling and the knee walls, metres; slopes, degrees."""
 
 TOP_A = (HEIGHT - KNEE_A) / np.tan(np.deg2rad(PITCH_A))
 TOP_B = WIDTH - (HEIGHT - KNEE_B) / np.tan(np.deg2rad(PITCH_B))
-"""y of the edges of the flat ceiling."""
+"""y of the two edges of the flat ceiling."""
 
 GABLE, SKEW, MIDDLE = 4.9, 9.0, (2.1, 2.0, 1.2)
-"""x of the skewed gable at y = 0, its angle to the y axis in degrees, and a point to which all walls face."""
+"""x of the skewed gable at y = 0, its angle to the y axis in degrees, and a point that all walls face."""
 
 DORMER, DORMER_TOP, ROOF_WINDOW, RECESS = (1.45, 2.75), 2.0, (2.75, 3.75, 0.40, 0.90), 0.12
-"""x of the dormer's cheeks and the height of its ceiling; the roof window's x from and to and shares of the slope's
-length from and to; how far both lie behind the walls."""
+"""x of the dormer's cheeks and the height of its ceiling; the roof window's range in x and its range along the slope,
+as shares of the slope's length; the depth of both behind the walls."""
 
 PAINT, GLOSS = Material(color=WARM_WHITE), Material("plastic", (0.84, 0.83, 0.79), 0.3)
 
@@ -40,16 +40,16 @@ TARGETS = [(3.1, -0.9, 0.6), (5.6, 1.1, 0.5), (4.8, 2.1, 0.7), (4.2, 3.9, 0.6), 
 TARGETS += [(0.6, 2.0, -0.1), (1.5, 2.1, 0.6), (0.6, -0.6, 1.9), (3.1, 1.7, 2.3), (3.2, 2.1, 2.3), (2.8, 3.2, 2.3)]
 TARGETS += [(2.7, 3.2, 2.3), (2.3, 3.7, 2.3), (2.0, 3.5, 2.2), (0.6, 2.1, 2.1), (0.0, 1.6, 2.2), (1.5, -1.0, 1.2)]
 FEET = -0.15
-"""The way of the photographer through the room, and what is looked at from each place."""
+"""Positions of the photographer in the room, the target of the view from each, and the height of the feet."""
 
 
 def gable_x(y: float) -> float:
-    """Where the skewed gable is."""
+    """Return x of the skewed gable at y."""
     return GABLE + y * float(np.tan(np.deg2rad(SKEW)))
 
 
 def flat(name: str, corners, material: Material = PAINT) -> Part:
-    """A convex plane polygon that faces MIDDLE."""
+    """Return a convex plane polygon that faces MIDDLE."""
     corners = np.asarray(corners, dtype=np.float64)
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     corners = corners if normal @ (np.asarray(MIDDLE) - corners[0]) > 0.0 else corners[::-1]
@@ -57,8 +57,8 @@ def flat(name: str, corners, material: Material = PAINT) -> Part:
 
 
 def slope(name: str, low, high, hole: tuple[float, float, float, float]) -> Part:
-    """A slope from its lower to its upper edge, (y, z) each, from gable to gable, with a hole (x from and to, shares of
-    the way up from and to)."""
+    """Return a slope from its lower to its upper edge, (y, z) each, from gable to gable, with a hole (range in x, range
+    along the slope as shares)."""
     x0, x1, t0, t1 = hole
 
     def at(x: float, t: float) -> list[float]:
@@ -105,7 +105,7 @@ def dormer() -> list[Part]:
 
 
 def roof_window() -> tuple[list[Part], Light]:
-    """A window recessed in slope B: the recess lined with wood, a frame, and the bright sky behind it."""
+    """Return a window recessed in slope B, its recess lined with wood, a frame, and the bright sky behind it."""
     x0, x1, t0, t1 = ROOF_WINDOW
     low, high = np.array([0.0, WIDTH, KNEE_B]), np.array([0.0, TOP_B, HEIGHT])
     length, deep = float(np.linalg.norm(high - low)), RECESS
@@ -113,7 +113,7 @@ def roof_window() -> tuple[list[Part], Light]:
     inward = np.cross(along, up)
     corner, wide, tall = low + t0 * (high - low) + (x0, 0, 0), x1 - x0, (t1 - t0) * length
     pine = Material(color=(0.58, 0.46, 0.33))
-    # Made upright with the room at -y, then leaned.
+    # Built upright with the room at -y, then tilted into the slope.
     parts = [
         box("recess", (0.0, deep, 0.0), (wide, 0.0, tall), pine, sides="xXzZ"),
         border("roof window", (0.0, wide), (deep - 0.05, deep), (0.0, tall), 0.07, pine),
@@ -127,7 +127,7 @@ def rounded(name: str, lower, upper, radius: float, material: Material) -> Part:
     """An axis-parallel box whose edges and corners are rounded."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     ball = sphere(name, (0.0, 0.0, 0.0), 1.0, material, segments=48)
-    # The eighths of a sphere, pulled apart.
+    # The octants of a sphere, moved apart.
     way = np.round(ball.vertices, 9)
     return replace(
         ball, vertices=0.5 * (lower + upper) + np.sign(way) * (0.5 * (upper - lower) - radius) + radius * way
@@ -135,10 +135,10 @@ def rounded(name: str, lower, upper, radius: float, material: Material) -> Part:
 
 
 def blanket(seed: int) -> Part:
-    """A blanket 1.4 m long over the mattress of `bed`, that hangs over its front edge; folds run along it."""
+    """Return a blanket 1.4 m long over the mattress of `bed`, hanging over its front edge, with folds along it."""
     rng = np.random.default_rng([seed, 31])
     u, v = np.meshgrid(np.linspace(0.0, 1.40, 141), np.linspace(0.0, 1.22, 123), indexing="ij")
-    # From the slope over the top, round the edge at v = 0.82, and down.
+    # v runs from the slope over the top, around the edge at v = 0.82, and down.
     radius, angle = 0.07, np.clip((v - 0.82) / 0.07, 0.0, 0.5 * np.pi)
     down = np.maximum(v - 0.82 - 0.5 * np.pi * radius, 0.0)
     y = 3.98 - np.minimum(v, 0.82) - radius * np.sin(angle)
@@ -171,7 +171,7 @@ def bed(seed: int) -> list[Part]:
 
 
 def bedside(seed: int) -> list[Part]:
-    """A small table with a lamp under a conical shade, which is off."""
+    """Return a small table with a lamp, switched off, under a conical shade."""
     foot = [(0.0, 0.0), (0.075, 0.0), (0.075, 0.012), (0.012, 0.022), (0.009, 0.05), (0.009, 0.37), (0.0, 0.38)]
     lamp = [lathe("lamp foot", foot, Material("metal", roughness=0.25))]
     lamp.append(lathe("lamp shade", [(0.135, 0.20), (0.075, 0.38)], Material(color=(0.85, 0.80, 0.68))))
@@ -179,7 +179,7 @@ def bedside(seed: int) -> list[Part]:
 
 
 def ceiling_lamp() -> tuple[list[Part], Light]:
-    """A flat box under the ceiling, whose lower side shines."""
+    """Return a flat box under the ceiling whose lower side emits light."""
     x, y, z = (2.0, 2.9), (TOP_A + 0.27, TOP_B - 0.27), HEIGHT - 0.04
     light = Light((x[0], y[0], z - 0.001), (0, y[1] - y[0], 0), (x[1] - x[0], 0, 0), (12.6, 11.8, 10.4))
     return [box("ceiling lamp", (x[0], y[0], z), (x[1], y[1], HEIGHT), GLOSS, sides="xXyY")], light
@@ -224,7 +224,8 @@ def armchair() -> list[Part]:
 
 
 def at_skewed_gable(subject: TexturedMesh, seed: int) -> list[Part]:
-    """What stands and hangs at the skewed gable, where y is along it and x = 0: cupboard, figure, picture, skirting."""
+    """Return the things at the skewed gable, in a frame with y along it and x = 0: cupboard, figure, picture,
+    skirting."""
     oak = Material("plastic", textures.wood((512, 1024), 3, seed + 4, color=(0.48, 0.34, 0.24)), 0.25)
     parts = [
         box("cupboard", (-0.40, 0.90, 0.0), (-0.012, 2.10, 0.72), GLOSS),
@@ -239,7 +240,8 @@ def at_skewed_gable(subject: TexturedMesh, seed: int) -> list[Part]:
 
 
 def picture(corner, along, height: float, seed: int) -> list[Part]:
-    """A framed picture whose lower edge is `along`, (x, y, 0), from `corner`; it faces to the right of that way."""
+    """Return a framed picture whose lower edge runs from `corner` along `along`, (x, y, 0); it faces to the right of
+    that direction."""
     corner, along = np.asarray(corner, dtype=np.float64), np.asarray(along, dtype=np.float64)
     out = np.cross(along, (0.0, 0.0, 0.02)) / np.linalg.norm(along)
     paint = Material(color=textures.cover((512, 400), seed, color=(0.30, 0.36, 0.33)))
@@ -286,7 +288,7 @@ def on_the_floor() -> list[Part]:
 
 
 def attic_scene(subject: TexturedMesh, seed: int) -> Stage:
-    """The stage; `subject` is a figurine 26 cm high on the cupboard, z up."""
+    """Return the stage; `subject` is a figurine 26 cm high on the cupboard, z up."""
     (skylight, day), (lamp, evening) = roof_window(), ceiling_lamp()
     parts = shell(seed) + dormer() + skylight + lamp
     parts += bed(seed) + bedside(seed) + desk(seed) + armchair() + plant(seed) + on_the_floor()
@@ -296,5 +298,5 @@ def attic_scene(subject: TexturedMesh, seed: int) -> Stage:
 
 
 def attic_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks twice round the room."""
+    """Return training and held-out (4, 4) world-to-camera poses of a walk twice around the room."""
     return camera_paths.walk(np.insert(STATIONS, 2, FEET, axis=1), np.array(TARGETS), views, test_views, seed)

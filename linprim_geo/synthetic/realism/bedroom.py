@@ -33,23 +33,23 @@ WIDTH, DEPTH, HEIGHT = ROOM
 
 WINDOW_X, WINDOW_Z, WINDOW_DEPTH = (1.15, 2.55), (0.88, 2.12), 0.2
 DOOR_X, DOOR_HEIGHT, DOOR_DEPTH = (2.9, 3.75), 2.02, 0.08
-"""Holes of the right and the front wall, metres from the wall's left end."""
+"""Openings of the right and the front wall, metres from the wall's left end."""
 
 LAMP, LAMP_HALF, LAMP_BOTTOM = (2.1, -1.95), 0.21, HEIGHT - 0.07
-"""Middle of the square lamp, half its side, and how high its lower side is, metres."""
+"""Centre of the square lamp, half its side, and the height of its lower side, metres."""
 
 LACQUER = 0.77
-"""Lacquer whose three values are above it is taken for white."""
+"""Lacquer with all three sRGB values above this counts as white."""
 
 STALK = 0.04
-"""Of a leaf of the rubber plant, metres."""
+"""Length of the stalk of a leaf of the rubber plant, metres."""
 
 BOOKS = (
     ((0.15, 0.215, 0.03), (0.26, 0.33, 0.42), 12.0),
     ((0.135, 0.205, 0.022), (0.68, 0.58, 0.36), -6.0),
     ((0.12, 0.18, 0.018), (0.50, 0.18, 0.17), 22.0),
 )
-"""Size, sRGB and turn of the books beside the bed, the lowest first."""
+"""Size, sRGB and rotation (degrees) of the books beside the bed, from the lowest."""
 
 STATIONS = [(1.12, -1.05), (1.1, -1.7), (1.15, -2.4), (1.5, -2.6), (2.2, -2.6), (2.9, -2.6), (3.45, -2.45), (3.6, -1.9)]
 STATIONS += [(3.6, -1.2), (3.55, -0.8), (3.6, -1.4), (3.5, -2.2), (2.8, -2.5), (2.1, -2.5), (1.5, -2.3), (1.15, -1.6)]
@@ -57,7 +57,7 @@ STATIONS += [(1.1, -0.95), (1.12, -1.6)]
 TARGETS = [(4.0, -1.9, 1.1), (4.2, -1.2, 0.9), (3.0, 0.0, 0.9), (2.6, 0.0, 0.8), (2.4, 0.0, 1.0), (1.6, 0.0, 0.8)]
 TARGETS += [(0.4, -0.4, 1.0), (0.4, -1.2, 0.9), (0.6, -2.0, 0.7), (1.4, -3.2, 0.6), (2.0, -3.6, 0.7), (0.9, -3.6, 1.2)]
 TARGETS += [(0.5, -2.4, 1.8), (0.4, -0.7, 1.8), (1.7, 0.0, 1.5), (2.6, -0.4, 0.5), (3.6, -2.6, 0.3), (3.9, -3.2, 0.7)]
-"""The way of the photographer round the foot of the bed and back, and what is looked at from each place."""
+"""Positions of the photographer around the foot of the bed and back, and the target of the view from each."""
 
 
 def leaf_outline(x: float, y: float, angle: float, long: float, wide: float) -> list[tuple[float, float]]:
@@ -228,7 +228,7 @@ def books(place: tuple[float, float, float], seed: int) -> list[Part]:
 
 
 def wardrobe() -> list[Part]:
-    """A plain white wardrobe of three doors at the left wall, made for the back one."""
+    """Return a plain white wardrobe of three doors for the left wall, in the frame of the back wall."""
     white = Material("plastic", (0.84, 0.84, 0.82), 0.25)
     steel = Material("metal", roughness=0.25)
     x0, x1, deep, high = 1.55, 3.35, 0.58, 2.12
@@ -321,14 +321,15 @@ def lamps() -> tuple[list[Part], list[Light]]:
     ]
     rim = [box("rim", (*p, low - 0.006), (*q, low + 0.001), WHITE) for p, q in bars]
     shine = Light((x - inner, y + inner, low), (2 * inner, 0, 0), (0, -2 * inner, 0), (9.5, 8.9, 7.9))
-    # Of the right wall: x from its left end is -y of the room.
+    # In the frame of the right wall, x from its left end is -y of the room.
     (a, b), (c, d) = WINDOW_X, WINDOW_Z
     day = Light((WIDTH + WINDOW_DEPTH, -a, c), (0, a - b, 0), (0, 0, d - c), (4.6, 4.9, 5.2))
     return [housing, joined("rim", rim)], [shine, day]
 
 
 def lacquered(part: Part) -> Part:
-    """White lacquer as bright as that of real furniture: the coat takes a good part of the light."""
+    """Return the part with white lacquer brightened to the look of real furniture, as the clear coat absorbs a good
+    part of the light."""
     color = part.material.color
     if part.material.kind != "plastic" or isinstance(color, np.ndarray) or min(color) < LACQUER:
         return part
@@ -337,7 +338,7 @@ def lacquered(part: Part) -> Part:
 
 
 def bedroom_scene(seed: int) -> Stage:
-    """The stage."""
+    """Return the stage."""
     lamp, lights = lamps()
     parts = [*shell(seed), *curtains(seed), *bed(seed), *bedside(seed), *on_wall("left", ROOM, wardrobe())]
     parts += [*picture(), *lamp]
@@ -348,7 +349,7 @@ def bedroom_scene(seed: int) -> Stage:
 
 
 def bedroom_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks round the foot of the bed and
-    back and looks across the room."""
+    """Return training and held-out (4, 4) world-to-camera poses of a walk around the foot of the bed and back, looking
+    across the room."""
     feet = np.insert(np.array(STATIONS), 2, 0.0, axis=1)
     return camera_paths.walk(feet, np.array(TARGETS), views, test_views, seed)

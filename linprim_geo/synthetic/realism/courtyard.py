@@ -1,8 +1,8 @@
 """The inner courtyard of an old southern house: lime plaster, a wall of rubble, an arcade, an outside stair, a well.
 
-The yard is 9 by 7 m, x from 0 and y down from 0. The stair goes up along the wall at y = 0, the arcade is at x = 0, the
-double door in the wall at y = -7, and the rubble at x = 9. What is beyond the walls is the backdrop, see
-`courtyard_backdrop`.
+The yard is 9 by 7 m, x from 0 upwards and y from 0 downwards. The stair goes up along the wall at y = 0, the arcade is
+at x = 0, the double door in the wall at y = -7, and the rubble at x = 9. The surroundings beyond the walls are the
+backdrop, see `courtyard_backdrop`.
 """
 
 from __future__ import annotations
@@ -55,19 +55,19 @@ from linprim_geo.synthetic.realism.render import Stage
 from linprim_geo.synthetic.realism.soft_furnishings import flipped
 
 LENGTH, DEPTH = 9.0, 7.0
-"""Of the yard along x and y, metres."""
+"""Size of the yard along x and y, metres."""
 
 SIZE = (LENGTH, DEPTH, 0.0)
-"""For `on_wall`."""
+"""Size of the yard as an argument of `on_wall`."""
 
 STAIR_EAVES, ARCADE_EAVES, DOOR_EAVES, RUBBLE_TOP = 5.5, 4.4, 4.9, 3.5
 """Heights of the four walls, metres."""
 
 ASIDE = 2.6
-"""The houses of stair and door go on beyond the yard by so many metres."""
+"""Length by which the houses with the stair and the door extend beyond the yard, metres."""
 
 SUN = (125.0, 48.0)
-"""Its azimuth, from +y towards +x, and elevation, degrees."""
+"""Azimuth of the sun, from +y towards +x, and its elevation, degrees."""
 
 OCHRE, PALE, WHITEWASH = (0.83, 0.70, 0.50), (0.84, 0.75, 0.60), (0.86, 0.83, 0.76)
 """sRGB of the paints."""
@@ -75,18 +75,18 @@ OCHRE, PALE, WHITEWASH = (0.83, 0.70, 0.50), (0.84, 0.75, 0.60), (0.86, 0.83, 0.
 UPPER_DOOR: Hole = (LANDING_X[0] + 0.35, LANDING_X[0] + 1.17, TOP, TOP + 2.05)
 BARRED: Hole = (1.0, 1.85, 1.15, 2.15)
 UPPER_WINDOW: Hole = (2.55, 3.35, 3.55, 4.65)
-"""Openings of the wall with the stair; x, z from and to."""
+"""Openings of the wall with the stair: ranges of x and z."""
 
 PORTAL, PORTAL_TOP = (3.55, 5.35), 2.45
 SHUTTERED: tuple[Hole, ...] = ((1.15, 2.05, 1.0, 2.3), (6.7, 7.6, 1.0, 2.3))
 """Openings of the wall with the double door, x from its left end."""
 
 ARCHES, SPRING, PIER, BETWEEN, THICK = 3, 2.20, 0.45, 0.42, 0.42
-"""Of the arcade: arches, where they begin to bend, width of the piers at its ends and from arch to arch, and thickness
-of the wall, metres."""
+"""The arcade: number of arches, height where they begin to curve, width of the piers at its ends and between arches,
+and thickness of the wall, metres."""
 
 GALLERY, GALLERY_FLOOR, CEILING = 2.3, 0.14, 3.4
-"""Behind the arcade: its back wall behind the face of the arcade, heights of floor and ceiling, metres."""
+"""The gallery: depth of its back wall behind the face of the arcade, heights of floor and ceiling, metres."""
 
 WELL = (4.8, -3.9)
 
@@ -99,19 +99,19 @@ PLANTS = (
     ("agave", 0.17, (2.92, -6.6)),
     ("geranium", 0.17, (8.6, -5.9)),
 )
-"""Pots on the paving: plant, radius and place, metres."""
+"""Pots on the paving: plant, radius and position, metres."""
 
 ON_STEPS = ((0.10, (3.16, -0.22, RISE)), (0.10, (4.0, -0.2, 4 * RISE)), (0.13, (7.9, -0.24, TOP)))
-"""Pots on the stair: radius and place, metres."""
+"""Pots on the stair: radius and position, metres."""
 
 SUNK = 0.004
-"""Things stand so much in the uneven paving, metres, for none to hover."""
+"""Depth by which things are sunk into the uneven paving, metres, so that none hovers."""
 
 ACROSS = [(7.3, -5.3), (5.0, -5.7), (2.3, -5.4), (1.5, -4.4), (1.4, -2.9), (2.0, -1.9), (4.6, -1.75), (6.9, -1.8)]
 ACROSS += [(7.6, -3.0), (7.5, -4.4)]
 SEEN = [(4.5, 0.0, 1.6), (4.2, 0.0, 1.7), (6.0, -0.6, 1.6), (9.0, -2.2, 1.5), (9.0, -4.3, 1.4), (6.5, -7.0, 1.5)]
 SEEN += [(4.2, -7.0, 1.4), (1.5, -6.5, 1.5), (0.0, -4.4, 1.8), (0.0, -2.6, 1.8)]
-"""The first way round the yard, and what is looked at on its other side."""
+"""The first path around the yard, and the targets on the opposite side."""
 
 NEAR = [(6.5, -4.9), (5.0, -5.35), (3.0, -5.1), (2.3, -4.6), (2.2, -3.6), (2.2, -2.6), (2.9, -2.15), (4.6, -2.2)]
 NEAR += [(6.4, -2.4), (7.1, -3.1), (7.2, -4.3)]
@@ -124,23 +124,24 @@ SEEN_NEAR += [
     (9.0, -2.2, 1.4),
     (9.0, -4.6, 1.5),
 ]
-"""The second way, nearer to the well, and what is looked at of the side that one passes."""
+"""The second path, nearer to the well, and the targets on the near side."""
 
 
 @cache
 def whitewash(seed: int) -> Material:
-    """A coat of lime on smooth plaster, almost plain; `tile` metres that show it once are 2 to 2.4."""
+    """Return a coat of lime on smooth plaster, almost plain; use it with a `tile` of 2 to 2.4 metres."""
     return Material(color=textures.speckled(WHITEWASH, (1024, 1024), 0.012, seed + 42))
 
 
 @cache
 def fired(seed: int) -> Material:
-    """Of pots and jars."""
+    """Return the fired clay of pots and jars."""
     return clay(seed + 7)
 
 
 def aside(eaves_height: float, paint: Material, arcade: str) -> list[Part]:
-    """Where a house goes on at both ends of its wall; at the end `arcade`, `left` or `right`, above the gallery."""
+    """Return the parts of a house beyond both ends of its wall; at the end `arcade`, `left` or `right`, above the
+    gallery."""
     ends = {"left": (-ASIDE, 0.0), "right": (LENGTH, LENGTH + ASIDE)}
     parts = []
     for name, x in ends.items():
@@ -296,7 +297,7 @@ def in_the_yard(seed: int) -> list[Part]:
 
 
 def courtyard_scene(seed: int) -> Stage:
-    """The stage: the yard with its walls, the gallery, and roofs as far as they are seen."""
+    """Return the stage: the yard with its walls, the gallery, and the visible parts of the roofs."""
     parts = [
         *stair_side(seed),
         *on_wall("front", SIZE, door_side(seed)),
@@ -308,7 +309,7 @@ def courtyard_scene(seed: int) -> Stage:
 
 
 def courtyard_backdrop(seed: int) -> list[Part]:
-    """What is beyond the walls: cypresses, a tree and houses of the village, from 14 m on."""
+    """Return the surroundings beyond the walls: cypresses, a tree and houses of the village, from 14 m on."""
     rng = np.random.default_rng([seed, 121])
     far = []
     for x, y, height in ((19.5, -1.0, 10.5), (21.0, 0.4, 12.0), (24.0, -7.5, 11.0)):
@@ -321,7 +322,7 @@ def courtyard_backdrop(seed: int) -> list[Part]:
 
 
 def courtyard_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks round the yard twice: first looking
-    across it, then at the side that is passed."""
+    """Return training and held-out (4, 4) world-to-camera poses of two walks around the yard: the first looks across
+    it, the second at the near side."""
     feet = np.insert(np.array(ACROSS + NEAR), 2, 0.0, axis=1)
     return camera_paths.walk(feet, np.array(SEEN + SEEN_NEAR), views, test_views, seed)

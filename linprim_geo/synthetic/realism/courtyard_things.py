@@ -31,7 +31,7 @@ DARK = Material("plastic", (0.10, 0.11, 0.12), 0.06)
 """Panes with a dark room behind them."""
 
 RISE, GOING, STEPS = 0.17, 0.28, 14
-"""Height and depth of a step, metres, and how many there are up to the landing."""
+"""Height and depth of a step, metres, and number of steps up to the landing."""
 
 STAIR, LANDING, WIDE = 3.0, 1.5, 1.05
 """x of the lowest step, length of the landing, and width of the stair, metres."""
@@ -40,7 +40,7 @@ TOP = RISE * STEPS
 """Height of the landing, metres."""
 
 LANDING_X = (STAIR + GOING * (STEPS - 1), STAIR + GOING * (STEPS - 1) + LANDING)
-"""From and to, metres."""
+"""Range of the landing in x, metres."""
 
 CELLAR: Hole = (LANDING_X[0] + 0.30, LANDING_X[0] + 1.10, FOOT, 1.55)
 """A recess below the landing."""

@@ -30,7 +30,7 @@ def cup(seed: int) -> list[Part]:
 
 
 def spline2(controls, count: int) -> np.ndarray:
-    """`spline` in the plane of radius and height."""
+    """Return `spline` in the plane of radius and height."""
     flat = np.asarray(controls, dtype=np.float64)
     return spline(np.column_stack([flat, np.zeros(len(flat))]), count)[:, :2]
 
@@ -52,7 +52,7 @@ def book(seed: int) -> list[Part]:
 
 
 def desk_scene(subject: TexturedMesh, seed: int) -> Stage:
-    """The stage; `subject` is a figurine 26 cm high, z up."""
+    """Return the stage; `subject` is a figurine 26 cm high, z up."""
     floor = Material(color=textures.wood((1024, 1024), 10, seed + 1, color=(0.45, 0.34, 0.26)))
     steel, rubber = Material("metal", roughness=0.15), Material("plastic", (0.10, 0.10, 0.11), 0.3)
     r = 0.004
@@ -70,7 +70,7 @@ def desk_scene(subject: TexturedMesh, seed: int) -> Stage:
         (1.03, -0.80, TOP - 0.40),
     ]
     points = spline(way, 320)
-    # On the desk the curve stays at the radius above it.
+    # On the desk, the centre line is at least the cable's radius above the top.
     on_desk = points[:, 1] > -0.735
     points[on_desk, 2] = np.maximum(points[on_desk, 2], TOP + r)
     figurine = figure(subject, 0.26, Material("plastic", roughness=0.3), edge=0.002)

@@ -11,8 +11,8 @@ from linprim_geo.synthetic.realism.parts import Material, Part, box, joined, qua
 from linprim_geo.synthetic.realism.render import Stage
 
 WIDTH, HEIGHT, STOREY = 8.0, 6.0, 2.6
-"""Of the front below the cornice, and where the plaster of the ground floor ends, metres. It is the plane y = 0, its
-outside is -y."""
+"""Size of the front below the cornice, and the height of the plaster on the ground floor, metres. The front is the
+plane y = 0, its outside is -y."""
 
 RECESS = 0.18
 """Depth of windows and door, metres."""
@@ -22,7 +22,7 @@ DOOR = (3.45, 4.55, 0.15, 2.35)
 
 
 def wall(name: str, x: tuple, z: tuple, openings, material: Material, tile: float, y: float = 0.0) -> Part:
-    """A wall in the plane y that faces -y, without the rectangles (x0, x1, z0, z1) of its openings."""
+    """Return a wall in the plane y that faces -y, without the rectangles (x0, x1, z0, z1) of its openings."""
     xs = sorted({*x, *(edge for hole in openings for edge in hole[:2])})
     zs = sorted({*z, *(edge for hole in openings for edge in hole[2:])})
     cells = []
@@ -164,7 +164,8 @@ def ground(seed: int) -> list[Part]:
 
 
 def sunny_sky(seed: int, height: int = 256) -> np.ndarray:
-    """(height, 2 height, 3) linear radiance: a blue sky with soft clouds and a wide, hazy sun over the street."""
+    """Return (height, 2 height, 3) linear radiance: a blue sky with soft clouds and a wide, hazy sun over the
+    street."""
     rng = np.random.default_rng([seed, 21])
     v, u = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(2 * height)) / (2 * height), indexing="ij")
     polar, azimuth = np.pi * v, 2.0 * np.pi * u
@@ -177,7 +178,7 @@ def sunny_sky(seed: int, height: int = 256) -> np.ndarray:
     color = color + (0.5 * cover * np.sqrt(up[..., 0]))[..., None] * (np.array([0.85, 0.86, 0.88]) - color)
     elevation, turn = np.deg2rad(40.0), np.deg2rad(145.0)
     sun = np.array([np.sin(turn) * np.cos(elevation), np.cos(turn) * np.cos(elevation), np.sin(elevation)])
-    # A lobe 11 degrees wide: shadows with soft edges.
+    # The sun is 11 degrees wide, for soft shadows.
     color = color + 28.0 * np.exp(55.0 * (way @ sun - 1.0))[..., None] * np.array([1.0, 0.93, 0.80])
     below = way[..., 2] < 0.0
     color[below] = np.array([0.22, 0.21, 0.20])
@@ -185,7 +186,7 @@ def sunny_sky(seed: int, height: int = 256) -> np.ndarray:
 
 
 def facade_scene(seed: int) -> Stage:
-    """The stage: a front 8 m wide and 6.5 m high."""
+    """Return the stage: a front 8 m wide and 6.5 m high."""
     brick = Material(color=textures.brick(1024, seed))
     plaster = Material(color=textures.speckled((0.72, 0.66, 0.54), (2048, 2048), 0.06, seed, broad=0.8))
     stone = Material(color=textures.speckled((0.66, 0.64, 0.59), (1024, 1024), 0.07, seed + 3))
@@ -213,10 +214,10 @@ def facade_scene(seed: int) -> Stage:
 
 
 def street_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks along the other side of the street and
-    back, looking at the ground floor on the way and at the upper floor on the way back.
+    """Return training and held-out (4, 4) world-to-camera poses of a walk along the other side of the street and back,
+    looking first at the ground floor and on the way back at the upper floor.
 
-    The held-out views lie between training views and jitter independently.
+    The held-out views are spread over the same walk, with jitter of their own.
     """
     rng = np.random.default_rng([seed, 22])
     train = [_on_street((i + 0.5) / views, rng) for i in range(views)]
@@ -224,7 +225,7 @@ def street_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarra
 
 
 def _on_street(way: float, rng: np.random.Generator) -> np.ndarray:
-    """(4, 4) pose at a share of the walk."""
+    """Return the (4, 4) world-to-camera pose at a share of the walk."""
     back = way >= 0.5
     along = 2.0 * (1.0 - way) if back else 2.0 * way
     x = WIDTH * (1.15 * along - 0.075)

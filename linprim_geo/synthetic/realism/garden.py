@@ -36,7 +36,7 @@ from linprim_geo.synthetic.realism.parts import Material, Part, box, joined, lat
 from linprim_geo.synthetic.realism.render import Stage
 
 SUN = (205.0, 44.0)
-"""Its azimuth, from +y towards +x, and elevation, degrees."""
+"""Azimuth of the sun, from +y towards +x, and its elevation, degrees."""
 
 PATCH, LAWN_END = 1.95, 8.0
 """Radius of the gravel and of the lawn that is in the reference, metres."""
@@ -45,7 +45,7 @@ TOP = 0.74
 """Height of the table, metres."""
 
 GRAVEL_TILE, GRASS_TILE = 1.3, 2.6
-"""Metres that the images of gravel and grass show once."""
+"""Size of one repetition of the images of gravel and grass, metres."""
 
 STEPS = [(0.25, 2.55), (0.05, 3.25), (0.3, 3.95), (0.1, 4.7), (0.4, 5.4), (0.3, 6.15), (0.55, 6.9)]
 """Stepping stones on the lawn."""
@@ -58,21 +58,21 @@ SHRUBS = (
     (268, 4.7, 0.55, (0.36, 0.34, 0.20)),
     (312, 5.8, 0.75, (0.28, 0.42, 0.20)),
 )
-"""Azimuth in degrees from +x, distance and radius in metres, and sRGB."""
+"""Shrubs: azimuth in degrees from +x, distance and radius in metres, and sRGB."""
 
 TREES = [(-75, 21, 8), (-58, 27, 9), (-33, 22, 7.5), (-18, 31, 11), (2, 24, 9), (18, 29, 10), (34, 23, 8.5)]
 TREES += [(48, 33, 10), (122, 24, 9.5), (136, 30, 10), (150, 21, 8), (166, 26, 9), (181, 34, 11), (196, 23, 8)]
 TREES += [(213, 29, 9.5), (229, 22, 8.5), (246, 31, 10), (262, 26, 9), (75, 38, 12), (102, 36, 12)]
-"""Those of the backdrop that are near: azimuth in degrees from +x, distance and height in metres."""
+"""The near trees of the backdrop: azimuth in degrees from +x, distance and height in metres."""
 
 BUSHES = ((4.0, 12.3, 0.7), (-3.2, 12.4, 0.55), (9.2, 3.0, 0.9), (9.5, -3.5, 1.1), (10.5, -0.5, 1.2), (6.5, -8.3, 0.9))
-"""Of the backdrop: x, y and radius, metres."""
+"""Bushes of the backdrop: x, y and radius, metres."""
 
 RINGS = ((0.70, 372.0, 20.0), (0.30, 205.0, 150.0))
-"""Share of the views, degrees and first azimuth of the ring at chest and eye height and of the lower one."""
+"""Share of the views, range of azimuths and first azimuth (degrees) of the rings at chest to eye height, and lower."""
 
 Relief = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Heights by x and y, metres."""
+"""A function of x and y that returns heights, metres."""
 
 
 def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:

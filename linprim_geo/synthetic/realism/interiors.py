@@ -1,7 +1,7 @@
-"""What rooms of path-traced scenes have in common: walls, floor, lamps, windows, doors, tables, chairs.
+"""Building blocks for rooms of path-traced scenes: walls, floor, lamps, windows, doors, tables, chairs.
 
-What belongs to a wall is made for the back wall, y = 0 with the room at negative y and x from the wall's left end, and
-put on another one by `on_wall`.
+Parts of a wall are built in the frame of the back wall, y = 0 with the room at negative y and x from the wall's left
+end, and moved to another wall by `on_wall`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Span = tuple[float, float]
 
 
 def room(size: tuple[float, float, float], floor: Material, walls: dict[str, Material] | None = None) -> list[Part]:
-    """Floor, ceiling and four walls of a room of `size` metres, its back left lower corner at the origin.
+    """Return floor, ceiling and four walls of a room of `size` metres, its back left lower corner at the origin.
 
-    The room lies at positive x and negative y; `walls` replaces the warm white of walls by name.
+    The room is at positive x and negative y; `walls` replaces the warm white of walls, by name.
     """
     x, y, z = np.diag(size)
     paint = dict.fromkeys(WALLS, Material(color=WARM_WHITE)) | (walls or {})
@@ -46,7 +46,7 @@ def room(size: tuple[float, float, float], floor: Material, walls: dict[str, Mat
 
 
 def lamps(size: tuple[float, float, float]) -> list[Light]:
-    """A large soft ceiling light, half as wide as the room, and a window in the wall on the right."""
+    """Return a large soft ceiling light, half as wide as the room, and a window in the right wall."""
     width, depth, height = size
     return [
         Light((0.25 * width, -0.75 * depth, height - 0.02), (0, 0.5 * depth, 0), (0.5 * width, 0, 0), (5.0, 4.7, 4.2)),
@@ -65,7 +65,7 @@ def table(x: tuple[float, float], y: tuple[float, float], height: float, seed: i
 
 
 def on_wall(name: str, size: tuple[float, float, float], parts: Iterable[Part]) -> list[Part]:
-    """Parts made for the back wall, moved to a wall of a room of `size` metres."""
+    """Return parts built for the back wall, moved to another wall of a room of `size` metres."""
     x, y, _ = size
     corners = dict(zip(WALLS, ((0.0, 0.0, 0.0), (0.0, -y, 0.0), (x, -y, 0.0), (x, 0.0, 0.0)), strict=True))
     turns = dict(zip(WALLS, (0.0, 90.0, 180.0, -90.0), strict=True))
@@ -73,9 +73,11 @@ def on_wall(name: str, size: tuple[float, float, float], parts: Iterable[Part]) 
 
 
 def pierced_wall(size: Span, paint: Material, x: Span, z: Span, depth: float, *, tile: float = 1.0) -> list[Part]:
-    """A wall of width and height `size` with a rectangular hole whose sides go `depth` metres into the wall.
+    """Return a wall of width and height `size` with a rectangular hole, whose sides extend `depth` metres into the
+    wall.
 
-    The hole is open at its back. One from z = 0 is a doorway; `tile` metres show the image once.
+    The hole is open at its back. A hole from z = 0 is a doorway. `tile` is the size of one repetition of the image,
+    metres.
     """
     width, height = size
     low, (along, into, up) = np.array([x[0], 0.0, z[0]]), np.diag([x[1] - x[0], depth, z[1] - z[0]])
@@ -90,7 +92,7 @@ def pierced_wall(size: Span, paint: Material, x: Span, z: Span, depth: float, *,
 
 
 def border(name: str, x: Span, y: Span, z: Span, width: float, material: Material, *, bottom: bool = True) -> Part:
-    """Four bars along the edges of the rectangle x, z, inside of it, or three without the one at the bottom."""
+    """Return four bars along the inner edges of the rectangle x, z; three without the lower one if not `bottom`."""
     inner_x, top, foot = (x[0] + width, x[1] - width), z[1] - width, z[0] + width if bottom else z[0]
     bars = [
         box(name, (x[0], y[0], z[0]), (inner_x[0], y[1], z[1]), material),
@@ -103,9 +105,9 @@ def border(name: str, x: Span, y: Span, z: Span, width: float, material: Materia
 
 
 def window(x: Span, z: Span, depth: float) -> list[Part]:
-    """A window of two wings in a hole of a wall: frame, a handle, and a sill that reaches 5 cm into the room.
+    """Return a window of two wings in a hole of a wall: frame, handle, and a sill that extends 5 cm into the room.
 
-    The wings are 7 to 12 cm in front of the hole's back at `depth`; there is no glass.
+    The wings are 7 to 12 cm in front of the hole's back, which is at `depth`. There is no glass.
     """
     paint, metal = Material("plastic", (0.86, 0.86, 0.84), 0.2), Material("metal", roughness=0.25)
     back, middle, floor = depth - 0.07, 0.5 * (x[0] + x[1]), z[0] + 0.025
@@ -113,7 +115,7 @@ def window(x: Span, z: Span, depth: float) -> list[Part]:
         border("wing", (a + 0.04, b - 0.04), (back - 0.05, back), (floor + 0.04, z[1] - 0.04), 0.055, paint)
         for a, b in ((x[0], middle + 0.038), (middle - 0.038, x[1]))
     ]
-    # The upper face of the sill is the floor of the hole.
+    # The upper face of the sill also covers the lower side of the hole.
     low, high = (x[0] - 0.03, -0.05, z[0] - 0.01), (x[1] + 0.03, 0.0, floor)
     sill = [
         box("sill", low, high, paint, sides="xXyz"),
@@ -131,8 +133,8 @@ def window(x: Span, z: Span, depth: float) -> list[Part]:
 
 
 def door(x: Span, height: float, depth: float) -> list[Part]:
-    """A closed door in a doorway: a leaf with two sunk panels at `depth` behind the wall, a frame 15 mm proud of the
-    wall, a handle."""
+    """Return a closed door in a doorway: a leaf with two recessed panels, `depth` behind the wall, a frame 15 mm in
+    front of the wall, a handle."""
     paint, metal = Material("plastic", (0.84, 0.83, 0.79), 0.25), Material("metal", roughness=0.25)
     trim, sunk, stile = 0.07, 0.012, 0.12
     frame = border(
@@ -149,14 +151,14 @@ def door(x: Span, height: float, depth: float) -> list[Part]:
 
 
 def skirting(spans: Iterable[Span], material: Material, *, proud: float = 0.015, height: float = 0.08) -> Part:
-    """Boards along the foot of a wall, `proud` metres in front of it."""
+    """Return boards along the foot of a wall, `proud` metres thick."""
     boards = [box("skirting", (a, -proud, 0.0), (b, 0.0, height), material, sides="xXyZ") for a, b in spans]
     return joined("skirting", boards)
 
 
 def chair(material: Material) -> Part:
-    """A wooden chair over the origin that is looked at from the front along +y: four legs, a seat 46 cm high, a back of
-    five slats that leans backwards, 88 cm high."""
+    """Return a wooden chair at the origin, its front facing -y: four legs, a seat 46 cm high, and a back of five slats
+    that leans backwards, 88 cm high."""
     half, leg, seat, top = 0.20, 0.034, 0.46, 0.88
     ends = (-half, half - leg)
     pieces = [box("leg", (a, -half, 0.0), (a + leg, leg - half, seat - 0.025), material, sides="xXyY") for a in ends]
@@ -224,19 +226,20 @@ def poster(x: Span, z: Span, seed: int) -> list[Part]:
 
 
 def sharp(profile, edge: float = 0.04) -> np.ndarray:
-    """A profile (N, 2) for `lathe` whose edges stay sharp, though normals are interpolated over `edge` of a piece."""
+    """Return a profile (N, 2) for `lathe` with sharp edges: normals are interpolated only within a share `edge` of a
+    piece at its ends."""
     points = np.asarray(profile, dtype=np.float64)
     fine = points[:-1, None] + np.diff(points, axis=0)[:, None] * np.array([0.0, edge, 1.0 - edge])[:, None]
     return np.concatenate([fine.reshape(-1, 2), points[-1:]])
 
 
 def turned(name: str, profile, material: Material) -> Part:
-    """`lathe` with edges that stay sharp."""
+    """Return `lathe` of a profile, with sharp edges."""
     return lathe(name, sharp(profile), material)
 
 
 def pendant(place: tuple[float, float], ceiling: float) -> list[Part]:
-    """A lamp that hangs from the ceiling by a cable of 6 mm, its shade open below at 1.6 m."""
+    """Return a lamp that hangs from the ceiling by a cable of 6 mm; its shade is open downwards, at 1.6 m."""
     profile = [(0.16, 0.0), (0.15, 0.06), (0.10, 0.14), (0.03, 0.18), (0.025, 0.22), (0.0, 0.225)]
     inside = [(0.023, 0.178), (0.097, 0.138), (0.147, 0.059), (0.157, 0.0), (0.16, 0.0)]
     enamel = Material("plastic", (0.20, 0.33, 0.36), 0.15)

@@ -1,4 +1,4 @@
-"""A whole furnished kitchen from inside: plain walls, cupboards, sink, table, chairs, window, door, niche, soffit."""
+"""A furnished kitchen from inside: plain walls, cupboards, sink, table, chairs, window, door, niche, soffit."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ WIDTH, DEPTH, HEIGHT = ROOM
 WINDOW_X, WINDOW_Z, WINDOW_DEPTH = (1.38, 2.42), (1.08, 2.08), 0.22
 DOOR_X, DOOR_HEIGHT, DOOR_DEPTH = (0.4, 1.25), 2.02, 0.09
 NICHE_X, NICHE_Z, NICHE_DEPTH = (1.5, 2.1), (1.02, 1.66), 0.14
-"""Holes of the back, the front and the right wall, metres from the wall's left end."""
+"""Openings of the back, the front and the right wall, metres from the wall's left end."""
 
 COUNTER, FRONT, TALL = 0.90, 0.60, 3.38
-"""Height of the worktop, how far the cupboards reach into the room, and where the tall one begins."""
+"""Height of the worktop, depth of the cupboards, and x of the tall cupboard, metres."""
 
 UNITS = (0.0, 0.45, 0.95, 1.4, 1.9, 2.4, 3.0, 3.36)
 """Edges of the cupboards below the worktop: drawers first, the oven last but one."""
@@ -51,17 +51,18 @@ SINK_X, SINK_Y = (1.62, 2.18), (-0.53, -0.13)
 TABLE, TOP = (0.85, -2.0), 0.74
 
 LAMP = (1.5, 2.7), (-2.1, -1.5)
-"""Of the ceiling, x and y."""
+"""Range of the ceiling lamp in x and y, metres."""
 
 WALK_MIDDLE, WALK_RADIUS = (2.62, -1.98), (0.93, 0.88)
 AHEAD, LEVEL, TILT = 2.5, 1.1, 1.1
-"""Of the way: its middle and half its size; how far away the aim is, how high, and by how much that varies."""
+"""The path of the camera: its centre and half axes; distance of the target, its mean height, and the variation of the
+height, metres."""
 
 STEEL, CLAY = Material("metal", roughness=0.22), Material("plastic", (0.55, 0.30, 0.20), 0.2)
 
 
 def plaster(color: tuple[float, float, float], seed: int) -> Material:
-    """Paint that differs by a level or two from place to place."""
+    """Return paint that varies by one or two levels over the wall."""
     return Material(color=textures.speckled(color, (512, 512), 0.006, seed))
 
 
@@ -88,7 +89,7 @@ def shell(seed: int) -> list[Part]:
 
 
 def handle(x: float, y: float, z: float, *, half: float = 0.07, upright: bool = False) -> Part:
-    """A bar of 1 cm in front of y, 3 cm away from it."""
+    """Return a bar handle 1 cm thick, 3 cm in front of y."""
     along = np.array([0.0, 0.0, half]) if upright else np.array([half, 0.0, 0.0])
     out, middle = np.array([0.0, -0.03, 0.0]), np.array([x, y, z])
     ends = [middle - along, middle - along + out, middle + along + out, middle + along]
@@ -96,13 +97,13 @@ def handle(x: float, y: float, z: float, *, half: float = 0.07, upright: bool = 
 
 
 def panel(x: Span, z: Span, y: float, material: Material) -> Part:
-    """A front of a cupboard, 18 mm thick, 3 mm away from its neighbours."""
+    """Return the front of a cupboard, 18 mm thick, with gaps of 3 mm to its neighbours."""
     gap = 0.0015
     return box("front", (x[0] + gap, y - 0.018, z[0] + gap), (x[1] - gap, y, z[1] - gap), material, sides="xXyzZ")
 
 
 def base_cupboards(lacquer: Material) -> list[Part]:
-    """Doors, drawers and an oven below the worktop, on a plinth that stands back."""
+    """Return doors, drawers and an oven below the worktop, on a recessed plinth."""
     end, y = UNITS[-1], 0.018 - FRONT
     parts = [
         box("plinth", (0.0, -0.53, 0.0), (end, 0.0, 0.1), BLACK, sides="y"),
@@ -126,7 +127,7 @@ def worktop(seed: int) -> list[Part]:
     top = joined("worktop", [box("worktop", (*p, low), (*q, COUNTER), stone, tile=0.8) for p, q in slabs])
     basin = box("basin", (a, c, COUNTER - depth), (b, d, COUNTER), STEEL, sides="xXyYz")
     rim = border("rim", (a - 0.02, b + 0.02), (-0.002, 0.0), (c - 0.02, d + 0.02), 0.022, STEEL)
-    # The border stands upright: lay it on the worktop.
+    # The border is built upright and then laid on the worktop.
     x, y, z = rim.vertices.T
     rim = replace(rim, vertices=np.stack([x, z, COUNTER - y], axis=1))
     basin = replace(basin, faces=basin.faces[:, ::-1])
@@ -194,7 +195,7 @@ def vase(height: float = 0.24) -> Part:
 
 
 def upright_books(count: int, seed: int) -> list[Part]:
-    """Books that stand side by side from x = 0 on, their spines to -y."""
+    """Return books side by side from x = 0 on, their spines facing -y."""
     rng = np.random.default_rng([seed, 32])
     parts, x = [], 0.0
     for _ in range(count):
@@ -217,7 +218,7 @@ def lights() -> list[Light]:
 
 
 def seating(seed: int) -> list[Part]:
-    """The table with its chairs and what lies on it, the rug, the pendant."""
+    """Return the table with its chairs and the things on it, the rug, the pendant."""
     (x, y), birch = TABLE, Material("plastic", (0.66, 0.54, 0.40), 0.3)
     weave = textures.speckled((0.45, 0.20, 0.17), (512, 768), 0.12, seed + 3)
     weave[np.r_[30:48, 464:482]] = (205, 190, 160)
@@ -276,7 +277,7 @@ def on_the_walls(seed: int) -> list[Part]:
 
 
 def kitchen_scene(subject: TexturedMesh, seed: int) -> Stage:
-    """The stage; `subject` is a figurine 22 cm high on the worktop, z up."""
+    """Return the stage; `subject` is a figurine 22 cm high on the worktop, z up."""
     lacquer = Material("plastic", (0.66, 0.72, 0.74), 0.3)
     (left, right), (front, back) = LAMP
     flat = box("ceiling lamp", (left, front, HEIGHT - 0.04), (right, back, HEIGHT), WHITE)
@@ -286,7 +287,8 @@ def kitchen_scene(subject: TexturedMesh, seed: int) -> Stage:
 
 
 def kitchen_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Twice round the free floor, looking across the room, mostly up the first time and mostly down the second."""
+    """Return training and held-out poses of two rounds over the free floor, looking across the room, mostly upwards in
+    the first and mostly downwards in the second."""
     angle = np.linspace(0.0, 4.0 * np.pi, 48, endpoint=False)
     out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     feet, aims = WALK_MIDDLE + out * WALK_RADIUS, WALK_MIDDLE + out * WALK_RADIUS - AHEAD * out

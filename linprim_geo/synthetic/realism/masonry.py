@@ -1,6 +1,6 @@
-"""Old masonry: lime plaster that flakes, rubble, flagstones, walls that are not quite flat, arches, tiled eaves.
+"""Old masonry: flaking lime plaster, rubble, flagstones, uneven walls, arches, tiled eaves.
 
-What belongs to a wall is made for the plane y = 0 that faces -y, x from the wall's left end, as in `interiors`.
+Parts of a wall are built for the plane y = 0 that faces -y, with x from the wall's left end, as in `interiors`.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from linprim_geo.synthetic.realism.parts import Image, Material, Part, box, join
 from linprim_geo.synthetic.realism.soft_furnishings import flipped
 
 TEXEL = 0.004
-"""Of images that are laid on once, metres: a pixel of 480x360 from 1.4 m away."""
+"""Size of a texel of images that cover a wall once, metres: a pixel of 480x360 from 1.4 m away."""
 
 NET, ROUNDED = 0.03, 0.012
-"""Knots of the nets of uneven walls and the blur of their relief, metres."""
+"""Spacing of the mesh vertices of uneven walls, and the standard deviation of the blur of their relief, metres."""
 
 TAPER = 0.08
-"""An uneven wall is flat at its edges and comes to its full relief so many metres from them."""
+"""Distance from its edges at which an uneven wall has its full relief, metres; the edges themselves are flat."""
 
 FOOT = -0.06
-"""Height at which walls begin, below the lowest stone of the floor, metres."""
+"""Height of the foot of walls, below the lowest stone of the floor, metres."""
 
 LIME, SAND, MOSS = (0.74, 0.71, 0.65), (0.66, 0.60, 0.51), (0.30, 0.31, 0.21)
-"""sRGB of old mortar, of the coat below the plaster, and of what grows in joints."""
+"""sRGB of old mortar, of the coat below the plaster, and of moss in joints."""
 
 TILE_PITCH, TILE_RADIUS, COURSE = 0.22, 0.085, 0.36
-"""Of a roof of half-round tiles: from tile to tile, radius, and what is seen of a tile's length, metres."""
+"""Roof of half-round tiles: spacing, radius, and visible length of a tile, metres."""
 
 Hole = tuple[float, float, float, float]
-"""x from and to, z from and to, metres."""
+"""Range of x and range of z, metres."""
 
 Spot = tuple[float, float, float, float]
 """x, z, and two sizes, metres."""
@@ -47,8 +47,8 @@ Spot = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Skin:
-    """The face of a wall or floor of `size` metres: an image laid on once, and `relief` (H, W), by how many metres
-    each texel is in front of the plane, its first row at the top."""
+    """The surface of a wall or floor of `size` metres: an image that covers it once, and `relief` (H, W), the height of
+    each texel above the plane, metres, with the first row at the top."""
 
     image: Image
     relief: np.ndarray
@@ -56,23 +56,23 @@ class Skin:
 
     @property
     def material(self) -> Material:
-        """As dull as stone and plaster are."""
+        """The material, diffuse as stone and plaster are."""
         return Material(color=self.image)
 
     def lift(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """The relief, rounded by ROUNDED, at shares u and v of width and height."""
+        """Return the relief, blurred by ROUNDED, at shares u and v of width and height."""
         h, w = self.relief.shape
         smooth = gaussian_filter(self.relief, ROUNDED / TEXEL, mode="nearest")
         return map_coordinates(smooth, [(1.0 - v) * h - 0.5, u * w - 0.5], order=1, mode="nearest")
 
 
 def shape_of(size: Span) -> tuple[int, int]:
-    """Rows and columns of an image of `size` metres."""
+    """Return rows and columns of an image of `size` metres."""
     return round(size[1] / TEXEL), round(size[0] / TEXEL)
 
 
 def drift(rng: np.random.Generator, shape: tuple[int, int], metres: float) -> np.ndarray:
-    """Smooth noise of unit variance that changes over so many metres."""
+    """Return smooth noise of unit variance with a length scale in metres."""
     few = [max(4, round(n * TEXEL / metres) + 2) for n in shape]
     rows, columns = (
         CubicSpline(np.arange(f), np.eye(f))(np.linspace(0.0, f - 1.0, n)) for f, n in zip(few, shape, strict=True)
@@ -82,23 +82,23 @@ def drift(rng: np.random.Generator, shape: tuple[int, int], metres: float) -> np
 
 
 def mixed(share: np.ndarray, under, over) -> np.ndarray:
-    """Colours `under` where the share (H, W) is 0 and `over` where it is 1."""
+    """Return a blend of the colours `under`, where the share (H, W) is 0, and `over`, where it is 1."""
     share, under, over = (np.asarray(value, dtype=np.float32) for value in (share[..., None], under, over))
     return under + share * (over - under)
 
 
 def places(size: Span) -> tuple[np.ndarray, np.ndarray]:
-    """x and height above the lower edge of every texel, metres."""
+    """Return x and the height above the lower edge of every texel, metres."""
     h, w = shape_of(size)
     z, x = np.meshgrid(size[1] * (1.0 - (np.arange(h) + 0.5) / h), size[0] * (np.arange(w) + 0.5) / w, indexing="ij")
     return x, z
 
 
 def old_plaster(size: Span, color, seed: int, worn: Sequence[Spot] = (), runs: Sequence[Spot] = ()) -> Skin:
-    """Painted lime plaster: nearly plain, damp at its foot, with streaks below its upper edge.
+    """Return painted lime plaster: nearly plain, damp at its foot, with streaks below its upper edge.
 
-    `worn` are the x, z and half axes of places where the paint is off and, in their middle, the plaster, so that bricks
-    show; `runs` the x, z, width and length of stains below sills. z is from the lower edge.
+    `worn` are x, z and half axes of spots where the paint has come off and, in their middle, the plaster too, so that
+    bricks show. `runs` are x, z, width and length of stains below sills. z is measured from the lower edge.
     """
     rng = np.random.default_rng([seed, 101])
     shape = shape_of(size)
@@ -124,7 +124,7 @@ def old_plaster(size: Span, color, seed: int, worn: Sequence[Spot] = (), runs: S
     bricks = np.tile(tile, (*(-(-n // len(tile)) for n in shape), 1))[: shape[0], : shape[1]]
     bricks = mixed(0.25 + 0.1 * np.clip(drift(rng, shape, 0.08), -1, 2), bricks, LIME)
     image = mixed(brick, mixed(bare, paint, sand), bricks)
-    # Dust and shade along the broken edges.
+    # Dust and shading along the broken edges.
     for edge in (bare, brick):
         image *= (1.0 - 0.22 * gaussian_filter(4.0 * edge * (1.0 - edge), 0.8))[..., None]
     relief = 0.003 * drift(rng, shape, 0.7) + 0.0012 * drift(rng, shape, 0.2) - 0.003 * bare - 0.009 * brick
@@ -132,7 +132,7 @@ def old_plaster(size: Span, color, seed: int, worn: Sequence[Spot] = (), runs: S
 
 
 def rubble(size: Span, seed: int, stone: Span = (0.30, 0.17)) -> Skin:
-    """A wall of rough stones of about `stone` metres in uneven rows, with mortar between them."""
+    """Return a wall of rough stones of about `stone` metres in uneven rows, with mortar between them."""
     rng = np.random.default_rng([seed, 102])
     shape = shape_of(size)
     x, z = places(size)
@@ -166,8 +166,8 @@ def rubble(size: Span, seed: int, stone: Span = (0.30, 0.17)) -> Skin:
 
 
 def slabs(size: Span, tall: Span, long: Span, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of slabs of `tall` by `long` metres, from and to: number of the slab (H, W), distance from its edge, metres,
-    and its middle, one for each (N, 2)."""
+    """Return rows of slabs with sizes in the ranges `tall` and `long`, metres: the number of the slab (H, W), the
+    distance to its edge (H, W), metres, and the centres of all slabs (N, 2)."""
     rng = np.random.default_rng([seed, 103])
     shape = shape_of(size)
     x, z = places(size)
@@ -190,7 +190,7 @@ def slabs(size: Span, tall: Span, long: Span, seed: int) -> tuple[np.ndarray, np
 
 
 def flagstones(size: Span, seed: int, tall: Span = (0.34, 0.58), long: Span = (0.36, 0.95)) -> Skin:
-    """Worn slabs of limestone in rows, each a little higher or lower than the next, with earth and moss in joints."""
+    """Return worn slabs of limestone in rows, at slightly different heights, with earth and moss in joints."""
     rng = np.random.default_rng([seed, 104])
     shape = shape_of(size)
     x, z = places(size)
@@ -202,7 +202,7 @@ def flagstones(size: Span, seed: int, tall: Span = (0.34, 0.58), long: Span = (0
     grain += 0.035 * drift(rng, shape, 0.05) + 0.04 * drift(rng, shape, 0.3) + 0.04 * drift(rng, shape, 1.3)
     pits = np.clip(drift(rng, shape, 0.012) - 2.1, 0.0, 1.0)
     face = tones[number] * (1.0 + grain - 0.35 * pits)[..., None]
-    # Slabs are paler in their middle, where feet go.
+    # Slabs are paler in the middle, where they are walked on.
     face *= (0.93 + 0.07 * np.clip(edge / 0.06, 0.0, 1.0))[..., None]
     width = 0.007 + 0.002 * drift(rng, shape, 0.15)
     joint = 1.0 / (1.0 + np.exp((edge - width) / 0.0015))
@@ -217,7 +217,7 @@ def flagstones(size: Span, seed: int, tall: Span = (0.34, 0.58), long: Span = (0
 
 
 def knots(ends: Sequence[float], step: float = NET) -> np.ndarray:
-    """Places from the first to the last of `ends`, at most `step` apart, all of `ends` among them."""
+    """Return positions from the first to the last of `ends`, at most `step` apart, including all of `ends`."""
     edges = np.unique(np.round(np.asarray(ends, dtype=np.float64), 9))
     pieces = [
         np.linspace(a, b, int(np.ceil((b - a) / step - 1e-9)) + 1)[:-1]
@@ -227,7 +227,7 @@ def knots(ends: Sequence[float], step: float = NET) -> np.ndarray:
 
 
 def uneven_wall(name: str, skin: Skin, openings: Sequence[Hole] = ()) -> Part:
-    """A wall from z = FOOT with the relief of its skin, without the rectangles of its openings."""
+    """Return a wall from z = FOOT upwards with the relief of its skin, without the rectangles of its openings."""
     (width, height), low = skin.size, FOOT
     xs = knots([0.0, width, *(np.clip(edge, 0.0, width) for hole in openings for edge in hole[:2])])
     zs = knots([low, low + height, *(np.clip(edge, low, low + height) for hole in openings for edge in hole[2:])])
@@ -246,7 +246,7 @@ def uneven_wall(name: str, skin: Skin, openings: Sequence[Hole] = ()) -> Part:
 
 
 def uneven_floor(name: str, skin: Skin) -> Part:
-    """A floor over x from 0 on and y up to 0 with the relief of its skin."""
+    """Return a floor over x from 0 upwards and y up to 0, with the relief of its skin."""
     width, depth = skin.size
     x, y = np.meshgrid(knots([0.0, width], 0.025), knots([-depth, 0.0], 0.025), indexing="ij")
     uv = np.stack([x / width, y / depth + 1.0], -1)
@@ -255,8 +255,9 @@ def uneven_floor(name: str, skin: Skin) -> Part:
 
 
 def swept(name: str, rims: Sequence[np.ndarray], material: Material, tile: float) -> Part:
-    """A strip over polylines (N, 3) of equally many points: facing first way x from rim to rim; `tile` metres show
-    the image once."""
+    """Return a strip through polylines (N, 3) with equal numbers of points; its normal is the direction along the
+    polylines times (cross product) the direction from one to the next. `tile` is the size of one repetition of the
+    image, metres."""
     net = np.stack(rims, axis=1)
     along = np.cumsum([0.0, *np.linalg.norm(np.diff(net[:, 0], axis=0), axis=1)])[:, None]
     across = np.cumsum(np.linalg.norm(np.diff(net, axis=1), axis=2), axis=1)
@@ -266,8 +267,8 @@ def swept(name: str, rims: Sequence[np.ndarray], material: Material, tile: float
 
 
 def arch(middle: float, radius: float, spring: float, deep: float, skin: Skin, stone: Material) -> list[Part]:
-    """A half-round arch in a wall `deep` metres thick: what is between it and the rectangle round it, on both sides,
-    its soffit, and a ring of stone 15 cm wide and 3 cm proud of the wall."""
+    """Return a semicircular arch in a wall `deep` metres thick: the spandrels between it and its rectangle, on both
+    sides, its soffit, and a ring of stone 15 cm wide that protrudes by 3 cm."""
     turn = np.linspace(0.0, np.pi, 49)
 
     def bow(r: float, y: float) -> np.ndarray:
@@ -288,14 +289,15 @@ def arch(middle: float, radius: float, spring: float, deep: float, skin: Skin, s
 def round_arches(
     span: float, gap: float, first: float, count: int, spring: float
 ) -> tuple[list[float], list[Hole], Hole]:
-    """Middles of `count` arches `gap` metres apart from x = first on, the rectangles round them, and the one below."""
+    """Return the centres of `count` arches `gap` metres apart from x = first on, their rectangles, and the rectangle
+    below all of them."""
     lefts = first + (span + gap) * np.arange(count)
     above = [(float(a), float(a) + span, spring, spring + 0.5 * span + 0.05) for a in lefts]
     return [float(a) + 0.5 * span for a in lefts], above, (first, above[-1][1], FOOT, spring)
 
 
 def flat_back(openings: Sequence[Hole], size: Span, deep: float, material: Material) -> Part:
-    """The other side of a wall `deep` metres thick, which faces +y."""
+    """Return the back of a wall `deep` metres thick, which faces +y."""
     front = wall("back of the wall", (0.0, size[0]), (FOOT, FOOT + size[1]), openings, material, 2.0, deep)
     return flipped(front)
 
@@ -303,8 +305,8 @@ def flat_back(openings: Sequence[Hole], size: Span, deep: float, material: Mater
 def eaves(
     x: Span, level: float, lime: Material, seed: int, *, out: float = 0.30, depth: float = 1.8, slope: float = 0.36
 ) -> list[Part]:
-    """A cornice of two bands at the top of a wall, `level` metres high, and on it a roof of half-round tiles that
-    reaches `out` metres over the yard and `depth` metres back. The cornice is of `lime`."""
+    """Return a cornice of two bands made of `lime` at the top of a wall, `level` metres high, and a roof of half-round
+    tiles on it, which extends `out` metres over the yard and `depth` metres back."""
     rng = np.random.default_rng([seed, 105])
     wide = 0.45 * out
     bands = [
@@ -318,7 +320,7 @@ def eaves(
     off = ((share % 1.0) - 0.5) * TILE_PITCH / TILE_RADIUS
     courses = int(np.ceil((out + depth) / COURSE))
     which, at = np.repeat(np.arange(courses), rows), np.tile(np.linspace(0.0, 1.0, rows), courses)
-    # A tile is 1.5 cm narrower at its upper end and lies on the one below it.
+    # A tile is narrower at its upper end by 12 % and lies on the one below it.
     round_off = TILE_RADIUS * np.sqrt(np.clip(1.0 - (off[:, None] / (1.0 - 0.12 * at)) ** 2, 0.0, 1.0))
     down = rng.normal(0.0, 0.004, (number + 1, courses))[np.minimum(share, number).astype(int)][:, which]
     back = -out + COURSE * (which + at)

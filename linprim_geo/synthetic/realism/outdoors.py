@@ -1,4 +1,4 @@
-"""What path-traced scenes in the open have in common: leaves, trees, hedges, far houses and hills, a sky."""
+"""Building blocks for path-traced outdoor scenes: leaves, trees, hedges, distant houses and hills, a sky."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from linprim_geo.synthetic.realism.parts import Material, Part, box, joined, lat
 
 GREEN, BARK = (0.30, 0.42, 0.17), (0.33, 0.27, 0.22)
 ROOFS = [(0.42, 0.27, 0.22), (0.30, 0.27, 0.26), (0.50, 0.33, 0.25)]
-"""sRGB."""
+"""sRGB of leaves, bark and roofs."""
 
 
 def foliage(name: str, middles: np.ndarray, size: float, tone, rng: np.random.Generator) -> Part:
-    """A leaf at each of `middles` (N, 3): a bent rhombus about `size` metres long, turned at random."""
+    """Return a leaf at each of `middles` (N, 3): a bent rhombus about `size` metres long, with random orientation."""
     count = len(middles)
     along, other = rng.standard_normal((2, count, 3))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -33,7 +33,7 @@ def foliage(name: str, middles: np.ndarray, size: float, tone, rng: np.random.Ge
 
 
 def painted(name: str, parts: Sequence[Part]) -> Part:
-    """Parts of plain materials as one dull part that has their colours at its vertices."""
+    """Return parts with plain materials as one diffuse part with their colours at its vertices."""
     whole = joined(name, [replace(part, uv=None, smooth=False) for part in parts])
     colors = [
         np.broadcast_to(np.asarray(part.material.color, dtype=np.float64), part.vertices.shape)
@@ -45,7 +45,7 @@ def painted(name: str, parts: Sequence[Part]) -> Part:
 
 
 def crown(count: int, middle, size, rng: np.random.Generator, clumps: int = 14) -> np.ndarray:
-    """(count, 3) places of leaves in clumps that fill an ellipsoid of half axes `size` round `middle`."""
+    """Return (count, 3) positions of leaves, in clumps that fill an ellipsoid of half axes `size` around `middle`."""
     centers = rng.standard_normal((clumps, 3))
     centers *= 0.68 * rng.uniform(0.5, 1.0, (clumps, 1)) / np.linalg.norm(centers, axis=1, keepdims=True)
     out = rng.standard_normal((count, 3))
@@ -54,7 +54,7 @@ def crown(count: int, middle, size, rng: np.random.Generator, clumps: int = 14) 
 
 
 def tree(place, height: float, count: int, leaf: float, tone, rng: np.random.Generator) -> list[Part]:
-    """A trunk, some branches and a crown of so many leaves."""
+    """Return a trunk, some branches and a crown of `count` leaves."""
     wide, bark = 0.33 * height * rng.uniform(0.85, 1.15), Material(color=BARK)
     thick = 0.022 * height
     trunk = [(1.5 * thick, 0.0), (thick, 0.08 * height), (0.8 * thick, 0.4 * height), (0.2 * thick, 0.8 * height)]
@@ -69,15 +69,15 @@ def tree(place, height: float, count: int, leaf: float, tone, rng: np.random.Gen
 
 
 def net_faces(rows: int, columns: int) -> np.ndarray:
-    """Two triangles for every cell of a net of vertices."""
+    """Return two triangles for every cell of a grid of vertices."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
 def hedge(start, end, tall: float, rng: np.random.Generator) -> Part:
-    """A clipped hedge 0.8 m wide whose foot goes from start to end, (x, y, z): over its profile a net of 5 cm whose
-    knots are off by some centimetres."""
+    """Return a clipped hedge 0.8 m wide along its foot from start to end, (x, y, z): a grid of 5 cm over its profile,
+    with vertices displaced by some centimetres."""
     start, end = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
@@ -98,7 +98,7 @@ def hedge(start, end, tall: float, rng: np.random.Generator) -> Part:
 
 
 def neighbour(place, turn: float, size, seed: int) -> list[Part]:
-    """A house of `size` (x, y and height of its eaves) with a gabled roof and dark windows."""
+    """Return a house of `size` (x, y and height of the eaves) with a gabled roof and dark windows."""
     rng = np.random.default_rng([seed, 43])
     x, y, z = 0.5 * size[0], 0.5 * size[1], size[2]
     paint = Material(color=tuple(rng.choice([(0.82, 0.79, 0.72), (0.78, 0.70, 0.55), (0.70, 0.71, 0.70)])))
@@ -119,7 +119,7 @@ def neighbour(place, turn: float, size, seed: int) -> list[Part]:
 
 
 def hills(seed: int) -> Part:
-    """Fields and woods 60 to 340 m away that rise by some 40 m, bluer the farther they are."""
+    """Return fields and woods at distances of 60 to 340 m that rise by some 40 m and are bluer with distance."""
     rng = np.random.default_rng([seed, 44])
     shape = (80, 1600)
     reach, angle = np.geomspace(60.0, 340.0, shape[0])[:, None], np.linspace(0.0, 2.0 * np.pi, shape[1])
@@ -141,9 +141,9 @@ def hills(seed: int) -> Part:
 
 
 def day(seed: int, sun: tuple[float, float], height: int = 512) -> np.ndarray:
-    """(height, 2 height, 3) linear radiance of a blue sky with clouds and a sun about 2 degrees wide.
+    """Return (height, 2 height, 3) linear radiance of a blue sky with clouds and a sun about 2 degrees wide.
 
-    `sun` is its azimuth, from +y towards +x, and its elevation in degrees.
+    `sun` is its azimuth, from +y towards +x, and its elevation, degrees.
     """
     rng = np.random.default_rng([seed, 46])
     polar, azimuth = np.pi * (np.arange(height) + 0.5) / height, np.pi * np.arange(2 * height) / height

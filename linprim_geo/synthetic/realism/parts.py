@@ -1,4 +1,4 @@
-"""Pieces of a path-traced scene: triangles with a material, and the shapes that scenes are put together from."""
+"""Parts of a path-traced scene: triangles with a material, and functions that make basic shapes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Image = np.ndarray
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface reflects light.
+    """The reflectance of a surface.
 
-    `kind` is `diffuse`, `plastic` (a rough clear coat over a diffuse base) or `metal`; `color` three sRGB values in
-    [0, 1] or an image looked up by uv, and ignored if the part has colours of its own; `roughness` is the alpha of
+    `kind` is `diffuse`, `plastic` (a rough clear coat over a diffuse base) or `metal`. `color` is three sRGB values in
+    [0, 1] or an image looked up by uv; it is ignored if the part has colours of its own. `roughness` is the alpha of
     the GGX distribution of coat and metal.
     """
 
@@ -31,7 +31,7 @@ class Material:
 class Part:
     """Triangles of one material, in metres, z up.
 
-    `vertices` (V, 3), `faces` (F, 3), `uv` (V, 2) or None, `colors` (V, 3) sRGB in [0, 1] or None, `smooth` whether
+    `vertices` (V, 3), `faces` (F, 3), `uv` (V, 2) or None, `colors` (V, 3) sRGB in [0, 1] or None; `smooth` is whether
     shading normals are interpolated.
     """
 
@@ -44,14 +44,15 @@ class Part:
     smooth: bool = False
 
     def moved(self, offset: Sequence[float], turn_deg: float = 0.0) -> Part:
-        """The part turned about the z axis and then moved."""
+        """Return the part rotated about the z axis and then translated."""
         angle = np.deg2rad(turn_deg)
         turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
         return replace(self, vertices=self.vertices @ turn.T + np.asarray(offset, dtype=np.float64))
 
 
 def quad(name: str, corner, edge_u, edge_v, material: Material, *, tile: float = 0.0) -> Part:
-    """A parallelogram whose normal is edge_u x edge_v; `tile` metres of it show the image once, 0: all of it."""
+    """Return a parallelogram with normal edge_u x edge_v; `tile` is the size of one repetition of the image, metres; 0
+    stretches it over the whole."""
     corner, edge_u, edge_v = (np.asarray(value, dtype=np.float64) for value in (corner, edge_u, edge_v))
     size = np.array([np.linalg.norm(edge_u), np.linalg.norm(edge_v)])
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
@@ -60,7 +61,7 @@ def quad(name: str, corner, edge_u, edge_v, material: Material, *, tile: float =
 
 
 def box(name: str, lower, upper, material: Material, *, tile: float = 0.0, sides: str = "xXyYzZ") -> Part:
-    """An axis-parallel box with outward faces; `sides` names those wanted, capital letters the upper ones."""
+    """Return an axis-parallel box with outward faces; `sides` selects its sides, capital letters are the upper ones."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     dx, dy, dz = np.diag(upper - lower)
     low, high = lower, upper
@@ -77,7 +78,7 @@ def box(name: str, lower, upper, material: Material, *, tile: float = 0.0, sides
 
 
 def joined(name: str, parts: Sequence[Part]) -> Part:
-    """Parts of the first one's material as one part."""
+    """Return parts as one part with the material of the first."""
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return replace(
         parts[0],
@@ -89,8 +90,8 @@ def joined(name: str, parts: Sequence[Part]) -> Part:
 
 
 def merged(parts: Sequence[Part]) -> list[Part]:
-    """The same surface with one part for each material and shading, which the path tracer renders much faster: dull
-    parts of one colour get it at their vertices."""
+    """Return the same surface with one part per material and shading, which the path tracer renders much faster.
+    Diffuse parts of one colour get it at their vertices."""
     groups: dict[tuple, list[Part]] = {}
     for part in parts:
         material, shape = part.material, part.vertices.shape
@@ -109,8 +110,8 @@ def merged(parts: Sequence[Part]) -> list[Part]:
 
 
 def lathe(name: str, profile, material: Material, *, segments: int = 96) -> Part:
-    """A profile (N, 2) of radius and height turned about the z axis; its outside is to the right of the profile's
-    way upwards."""
+    """Return the surface of revolution of a profile (N, 2) of radius and height about the z axis; its outside is to the
+    right of the profile's upward direction."""
     profile = np.asarray(profile, dtype=np.float64)
     angle = np.linspace(0.0, 2.0 * np.pi, segments + 1)
     rings = np.stack(
@@ -124,7 +125,7 @@ def lathe(name: str, profile, material: Material, *, segments: int = 96) -> Part
 
 
 def tube(name: str, path, radius: float, material: Material, *, segments: int = 16) -> Part:
-    """A round tube along a polyline (N, 3), open at both ends; its cross-sections do not twist."""
+    """Return a round tube along a polyline (N, 3), open at both ends, without twist of its cross-sections."""
     path = np.asarray(path, dtype=np.float64)
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -143,21 +144,21 @@ def tube(name: str, path, radius: float, material: Material, *, segments: int = 
 
 
 def _grid_faces(rows: int, columns: int) -> np.ndarray:
-    """Two triangles for every cell of a grid of vertices."""
+    """Return two triangles for every cell of a grid of vertices."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
 def sphere(name: str, center, radius: float, material: Material, *, segments: int = 96) -> Part:
-    """A sphere of latitudes and longitudes."""
+    """Return a sphere meshed by latitude and longitude."""
     angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, segments // 2 + 1)
     profile = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return lathe(name, profile, material, segments=segments).moved(center)
 
 
 def spline(controls, count: int) -> np.ndarray:
-    """(count, 3) points of a smooth curve through (N, 3) control points, evenly spaced in its parameter."""
+    """Return (count, 3) points of a smooth curve through (N, 3) control points, evenly spaced in its parameter."""
     from scipy.interpolate import CubicSpline
 
     controls = np.asarray(controls, dtype=np.float64)
@@ -166,9 +167,10 @@ def spline(controls, count: int) -> np.ndarray:
 
 
 def figure(surface: TexturedMesh, size: float, material: Material, *, edge: float) -> Part:
-    """A mesh with its colours at the vertices, standing on z = 0 over the origin; its longest side is `size` metres.
+    """Return a mesh with its colours at the vertices, standing on z = 0 over the origin; its longest side is `size`
+    metres.
 
-    `edge` is about the longest edge in metres: colours are as fine as that.
+    `edge` is about the longest edge in metres, and so the resolution of the colours.
     """
     scale = size / np.ptp(surface.used_vertices, axis=0).max()
     vertices, faces, colors = surface.refined(edge / scale)

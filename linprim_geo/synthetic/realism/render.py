@@ -1,4 +1,4 @@
-"""Path tracing by Mitsuba 3: parts and light become its scene, a camera an image of linear colour."""
+"""Path tracing by Mitsuba 3: converts parts and lights to its scene, and renders images of linear colour."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from linprim_geo.geometry.camera import Camera
 from linprim_geo.synthetic.realism.parts import Material, Part
 
 MAX_DEPTH = 5
-"""Longest path in segments; what is missing of a white room's light is below 1 %."""
+"""Longest path in segments. In a white room it loses less than 1 % of the light."""
 
 PASSES = 2
-"""Renderings of a view that are averaged, after what is far brighter in one than in the others was cut. More of them
-would cut more, but the samples of each are stratified: one pass of 64 has the noise of four of 27."""
+"""Number of renders of a view that are averaged after outliers between them are clipped. More passes would clip more
+outliers, but the samples of each pass are stratified: one pass of 64 has the noise of four of 27."""
 
 SEEN_SAMPLES = 16
-"""Rays a pixel by which the denoiser knows what is seen: edges are blurred as those of the light."""
+"""Rays per pixel for the albedo and normals of the denoiser; edges are then blurred as in the image."""
 
 FIREFLY = 3.0
-"""A pixel of one pass may be this many times the mean of the others, plus FIREFLY_FLOOR of the mean of the image."""
+"""Largest value of a pixel in one pass: this times the mean of the others, plus FIREFLY_FLOOR of the image's mean."""
 FIREFLY_FLOOR = 0.3
 
 VARIANTS = {"scalar": "scalar_rgb", "llvm": "llvm_ad_rgb"}
-"""Mitsuba's names of the tracers."""
+"""Mitsuba's names of the variants of the tracer."""
 
 
 @dataclass(frozen=True)
 class Light:
-    """A rectangle that shines to the side of edge_u x edge_v; `radiance` (3,) linear."""
+    """A rectangle that emits light to the side of edge_u x edge_v; `radiance` (3,) linear."""
 
     corner: tuple[float, float, float]
     edge_u: tuple[float, float, float]
@@ -46,9 +46,9 @@ class Light:
 
 @dataclass(frozen=True)
 class Stage:
-    """What is rendered: parts, rectangles of light, and `sky`, a latitude-longitude image (H, W, 3) of linear
-    radiance or None: row i + 0.5 of H is at i / H of the way from straight up to straight down, column j is along
-    azimuth 2 pi j / W from +y towards +x."""
+    """The content of a render: parts, rectangular lights, and `sky`, an equirectangular image (H, W, 3) of linear
+    radiance or None. Row i + 0.5 of H is at i / H of the way from straight up to straight down, column j at azimuth
+    2 pi j / W from +y towards +x."""
 
     parts: Sequence[Part]
     lights: Sequence[Light] = field(default_factory=tuple)
@@ -56,11 +56,11 @@ class Stage:
 
 
 class PathTracer:
-    """A stage ready to be rendered by one of the tracers of VARIANTS on so many threads, 0 for all cores; to `denoise`
-    takes the grain of the light paths away.
+    """A stage loaded for rendering by one of the tracers of VARIANTS on `threads` threads, 0 for all cores. `denoise`
+    removes the noise of the path tracer.
 
     Raises:
-        LinprimError: Mitsuba is not installed, or Open Image Denoise to denoise.
+        LinprimError: Mitsuba is not installed, or Open Image Denoise if it is to denoise.
     """
 
     def __init__(self, stage: Stage, tracer: str = "scalar", threads: int = 0, denoise: bool = False):
@@ -68,14 +68,15 @@ class PathTracer:
         self.denoiser: Any = load_denoiser() if denoise else None
         with tempfile.TemporaryDirectory(prefix="linprim-realism-") as name:
             description = self._describe(stage, Path(name))
-            # In parallel Mitsuba 3.9 loaded a sky whose sun lights nothing 1 time of 14, one by one never of 14.
+            # Loading in parallel, Mitsuba 3.9 gave a sky whose sun lights nothing in 1 of 14 cases, serially in none.
             self.scene = self.mi.load_dict(description, parallel=False)
 
     def render(self, camera: Camera, samples: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        """Linear radiance (H, W, 3) float32 and the standard error of each value, from `samples` paths a pixel.
+        """Return linear radiance (H, W, 3) float32 and the standard error of each value, from `samples` paths per
+        pixel.
 
-        Pixels are box-filtered and independent of each other, unless they are denoised; the error is that before. The
-        same seed gives the same image.
+        Pixels are box-filtered and independent of each other, unless they are denoised; the error is that before
+        denoising. The same seed gives the same image.
         """
         mi = self.mi
         sensor = mi.load_dict(self._sensor(camera))
@@ -88,7 +89,8 @@ class PathTracer:
         return (light if self.denoiser is None else self._denoised(light, sensor, seed)), error
 
     def _denoised(self, light: np.ndarray, sensor: Any, seed: int) -> np.ndarray:
-        """Light (H, W, 3) as albedo and normal of what is seen tell noise from edges and textures."""
+        """Return denoised light (H, W, 3), guided by albedo and normals, which separate noise from edges and
+        textures."""
         mi = self.mi
         seen = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
         found = np.array(mi.render(self.scene, sensor=sensor, integrator=seen, spp=SEEN_SAMPLES, seed=seed))
@@ -96,7 +98,7 @@ class PathTracer:
         return self.denoiser.denoise(light, albedo.clip(0, 1), normal, hdr=True)
 
     def _sensor(self, camera: Camera) -> dict[str, Any]:
-        """Mitsuba's perspective camera looks along +z with x to the left and y up."""
+        """Return Mitsuba's perspective camera, which looks along +z with x to the left and y up."""
         pose = camera.camera_to_world @ np.diag([-1.0, -1.0, 1.0, 1.0])
         width, height = camera.width, camera.height
         if abs(camera.fx - camera.fy) > 1e-9 * camera.fx:
@@ -107,7 +109,7 @@ class PathTracer:
             "fov_axis": "x",
             "near_clip": 1e-3,
             "far_clip": 1e4,
-            # How far the middle of the image is from the principal point, not the other way round.
+            # The offset of the middle of the image from the principal point, not the opposite.
             "principal_point_offset_x": 0.5 - camera.cx / width,
             "principal_point_offset_y": 0.5 - camera.cy / height,
             "to_world": self.mi.ScalarTransform4f(pose),
@@ -146,7 +148,7 @@ class PathTracer:
                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [float(c) for c in light.radiance]}},
             }
         if stage.sky is not None:
-            # Mitsuba has y up and -z at the first column.
+            # In Mitsuba's frame, y is up and -z is at the first column.
             turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
             scene["sky"] = {
                 "type": "envmap",
@@ -165,7 +167,7 @@ class PathTracer:
         if material.kind == "metal":
             bsdf = {"type": "roughconductor", "material": "Cr", "alpha": material.roughness, "distribution": "ggx"}
         elif material.kind == "plastic" and own_colors:
-            # Mitsuba's roughplastic wants the mean of its colour, which colours at vertices do not have.
+            # Mitsuba's roughplastic needs the mean of its colour, which vertex colours do not provide.
             roughness = float(np.sqrt(material.roughness))
             bsdf = {"type": "principled", "base_color": color, "roughness": roughness, "specular": 0.5}
         elif material.kind == "plastic":
@@ -182,8 +184,9 @@ class PathTracer:
 
 
 def without_outliers(images: np.ndarray) -> np.ndarray:
-    """(N, H, W, 3) renderings of one view without what is no number, which is the mean of the others there or of all
-    pixels, and without what is far brighter in one than in the others (FIREFLY)."""
+    """Return (N, H, W, 3) renders of one view without non-finite values and outliers. Non-finite values become the mean
+    of the others at that place, or of all pixels. Values are clipped where one render is far brighter than the others
+    (FIREFLY)."""
     known = np.isfinite(images)
     images = np.where(known, images, np.float32(0))
     times = known.sum(0)
@@ -194,7 +197,7 @@ def without_outliers(images: np.ndarray) -> np.ndarray:
 
 
 def load_mitsuba(tracer: str, threads: int) -> Any:
-    """Mitsuba with its variant and its number of threads set.
+    """Load Mitsuba, and set its variant and number of threads.
 
     Raises:
         LinprimError: the extra is not installed.
@@ -215,7 +218,7 @@ def load_mitsuba(tracer: str, threads: int) -> Any:
 
 
 def load_denoiser() -> Any:
-    """Open Image Denoise.
+    """Load Open Image Denoise.
 
     Raises:
         LinprimError: the extra is not installed.
@@ -230,7 +233,8 @@ def load_denoiser() -> Any:
 
 
 def write_part(path: Path, part: Part) -> None:
-    """A binary PLY as Mitsuba reads it: float32 positions, s and t with t down, linear colours."""
+    """Write a binary PLY in the form that Mitsuba reads: float32 positions, u and v with v downwards, linear
+    colours."""
     columns = {name: part.vertices[:, i] for i, name in enumerate("xyz")}
     if part.uv is not None:
         columns |= {"u": part.uv[:, 0], "v": 1.0 - part.uv[:, 1]}

@@ -1,4 +1,4 @@
-"""The path-traced scenes by name: their stage, their surface, the way of the camera, and pictures of them."""
+"""The path-traced scenes by name, with their surfaces, camera paths and exposure, and their images."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from linprim_geo.synthetic.shapes import cad_part, smooth_body
 from linprim_geo.synthetic.textured import FileAlbedo, PieceColors, TexturedMesh
 
 METAL_COLOR = (0.6, 0.6, 0.6)
-"""Of steel in the reference, which reflects its surroundings and has no colour of its own."""
+"""Colour of steel in the reference. Steel reflects its surroundings and has no colour of its own."""
 
 METER_VIEWS, METER_SAMPLES = 5, 16
 METER_SHARE, METER_LEVEL = 0.9995, 0.85
-"""Exposure: of this many views, this share of the values stays below this linear intensity, white being 1; a scene
-may have its own."""
+"""Exposure: in METER_VIEWS views, the share METER_SHARE of the values stays below the linear intensity METER_LEVEL,
+white being 1. A scene may have its own share and level."""
 
 SEEN_BY, MIN_FACING = 2, 0.05
-"""The reference holds what so many training views see, at more than 3 degrees from the surface."""
+"""The reference holds faces that SEEN_BY training views see, at more than 3 degrees from the surface."""
 
 OWN = ("path", "distance", "background", "environment", "table", "arc", "distortion", "specular", "shading", "zoom")
 OWN += ("detail", "texture", "supersample")
-"""Options that a path-traced scene decides by itself."""
+"""Options that a path-traced scene sets itself."""
 
 Poses = Callable[[int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]
 """(views, held-out views, seed) -> (4, 4) world-to-camera poses of both."""
@@ -50,10 +50,10 @@ Poses = Callable[[int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]
 
 @dataclass(frozen=True)
 class Scene:
-    """How a scene is built from its figure and a seed, how the camera goes, its horizontal field of view, and its
-    exposure (METER_SHARE), which is by the walls where lamps and windows are in the picture.
+    """The functions that build a scene from its figure and a seed and that return its camera poses, its horizontal
+    field of view, and its exposure (METER_SHARE), which is set by the walls where lamps and windows are in the image.
 
-    `backdrop` gives for a seed what is far behind it, which is in the pictures, but not in the reference, depth maps or
+    `backdrop` returns, for a seed, distant surroundings that are in the images, but not in the reference, depth maps or
     masks."""
 
     build: Callable[[TexturedMesh, int], Stage]
@@ -66,7 +66,7 @@ class Scene:
 
 
 def arc_poses(target: tuple[float, float, float], distance: float, degrees: float, azimuth: float) -> Poses:
-    """The path `arc` of `camera_paths` round a target, with its middle at an azimuth in degrees from +x."""
+    """Return the path `arc` of `camera_paths` around a target, with its middle at an azimuth in degrees from +x."""
 
     def poses(views: int, test_views: int, seed: int):
         angle = np.deg2rad(-azimuth)
@@ -119,7 +119,7 @@ SCENES = {
 
 
 class TracedScene:
-    """A scene as `synth` wants it: `surface`, `train` and `test` cameras, and `picture`, after `prepare`."""
+    """A scene for `synth`: its `surface`, `train` and `test` cameras, and `picture`, after a call of `prepare`."""
 
     def __init__(self, name: str, figure: TexturedMesh | None, options: SynthOptions):
         scene = SCENES[name]
@@ -141,10 +141,10 @@ class TracedScene:
         return Camera(width, height, focal, focal, 0.5 * width + dx, 0.5 * height + dy, pose)
 
     def prepare(self) -> None:
-        """Loads the path tracer and meters the exposure by some of the training views.
+        """Load the path tracer and set the exposure from some of the training views.
 
         Raises:
-            LinprimError: Mitsuba is not installed, or Open Image Denoise where it is asked for.
+            LinprimError: Mitsuba is not installed, or Open Image Denoise if it is to be used.
         """
         denoise = self.options.denoise == "on"
         stage = replace(self.stage, parts=[*self.stage.parts, *self.backdrop])
@@ -156,7 +156,7 @@ class TracedScene:
         )
 
     def picture(self, camera: Camera, split: str, number: int) -> np.ndarray:
-        """(H, W, 3) float32 sRGB of what a perfect camera would see."""
+        """Return (H, W, 3) float32 sRGB of an ideal camera."""
         assert self.tracer is not None
         light, _ = self.tracer.render(camera, self.options.samples, self._seed(int(split == "test"), number))
         return to_srgb(np.clip(self.exposure * light, 0.0, 1.0)).astype(np.float32)
@@ -166,7 +166,7 @@ class TracedScene:
 
 
 def refuse_own(name: str, options: SynthOptions) -> None:
-    """Raises LinprimError for options that a path-traced scene decides by itself."""
+    """Raise LinprimError for options that a path-traced scene sets itself."""
     for entry in changed_options(options):
         if entry.name in OWN:
             value = getattr(options, entry.name)
@@ -176,7 +176,7 @@ def refuse_own(name: str, options: SynthOptions) -> None:
 
 
 def surface_of(stage: Stage, name: str) -> TexturedMesh:
-    """All parts and, in white, the rectangles of light as one surface with their colours, without shading."""
+    """Return all parts and the rectangular lights, in white, as one surface with their colours, without shading."""
     white = Material(color=(1.0, 1.0, 1.0))
     lamps = [quad("light", light.corner, light.edge_u, light.edge_v, white) for light in stage.lights]
     vertices, faces, part, materials = [], [], [], []
@@ -207,7 +207,8 @@ def surface_of(stage: Stage, name: str) -> TexturedMesh:
 
 
 def seen_faces(caster: RayCaster, vertices: np.ndarray, faces: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """(F,) whether the middle of a face of the refined surface is seen by at least SEEN_BY of the cameras."""
+    """Return (F,) bool: whether at least SEEN_BY of the cameras see the centroid of each face of the refined
+    surface."""
     middle = vertices[faces].mean(axis=1)
     normal = np.cross(*(vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2)))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -219,7 +220,7 @@ def seen_faces(caster: RayCaster, vertices: np.ndarray, faces: np.ndarray, camer
             inside = (depth > 0) & (pixel > 0).all(1) & (pixel < (camera.width, camera.height)).all(1)
         inside &= np.abs((towards * normal).sum(1)) > MIN_FACING * np.linalg.norm(towards, axis=1)
         rows = np.flatnonzero(inside & (count < SEEN_BY))
-        # Stop short by a little, or the face would hide itself.
+        # Rays end a little before the face, as it would hide itself.
         margin = 1e-4 * caster.diagonal / np.linalg.norm(towards[rows], axis=1)
         count[rows] += ~caster.occluded(camera.center, towards[rows], 1.0 - margin)
     return count >= SEEN_BY

@@ -12,7 +12,7 @@ from linprim_geo.synthetic.textured import TexturedMesh
 
 ROOM = (3.4, 3.2, 2.6)
 LEFT, WIDTH, DEPTH, BOARDS = 0.25, 1.1, 0.34, (0.06, 0.44, 0.80)
-"""Of the shelf: from the left wall, its size, and the heights of its boards, metres."""
+"""The shelf: distance from the left wall, width, depth, and heights of its boards, metres."""
 
 PLACES = (
     (0.28, (0.52, -0.18, BOARDS[2]), -30.0),
@@ -20,11 +20,11 @@ PLACES = (
     (0.27, (0.70, -0.20, BOARDS[1]), 20.0),
     (0.26, (1.05, -0.20, BOARDS[1]), -20.0),
 )
-"""Longest side, place and turn in degrees of the figures."""
+"""Longest side, position and rotation in degrees of the figures."""
 
 
 def shelf_scene(figures: Sequence[TexturedMesh], seed: int) -> Stage:
-    """The stage; `figures` are placed in turn, z up."""
+    """Return the stage; `figures` are placed in turn, z up."""
     oak = Material("plastic", textures.wood((512, 2048), 3, seed, color=(0.66, 0.52, 0.36)), 0.3)
     stone = Material("plastic", textures.speckled((0.42, 0.41, 0.40), (1024, 1024), 0.08, seed), 0.08)
     right, top, thick = LEFT + WIDTH, BOARDS[-1], 0.025

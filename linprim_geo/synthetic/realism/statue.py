@@ -10,7 +10,7 @@ from linprim_geo.synthetic.textured import TexturedMesh
 
 ROOM = (7.0, 7.0, 2.8)
 MIDDLE, TOP = (3.5, -3.5), 0.78
-"""Of the table, metres."""
+"""Centre and height of the table, metres."""
 
 
 def pictures(seed: int) -> list[Part]:
@@ -39,7 +39,7 @@ def furniture(seed: int) -> list[Part]:
 
 
 def statue_scene(subject: TexturedMesh, seed: int) -> Stage:
-    """The stage; `subject` is 0.4 m high, z up."""
+    """Return the stage; `subject` is 0.4 m high, z up."""
     floor = Material("plastic", textures.wood((1024, 1024), 10, seed + 1, color=(0.50, 0.38, 0.28)), 0.3)
     x, y = MIDDLE
     parts = [

@@ -24,7 +24,7 @@ from linprim_geo.synthetic.realism.render import Stage
 from linprim_geo.synthetic.textured import TexturedMesh
 
 LENGTH, WING, EAVES = 9.0, 3.2, 2.62
-"""Of the long wall and the wing's, and the height of both, metres."""
+"""Length of the long wall, of the wing's wall, and the height of both, metres."""
 
 SLAB = (7.2, 5.2)
 """x and -y of the far corner of the paving, metres."""
@@ -37,19 +37,19 @@ DOOR, PANES = (1.25, 2.2, 0.1, 2.12), (3.75, 5.35, 0.95, 2.1)
 
 TABLE, TOP = (3.5, -2.6), 0.74
 SUN = (236.0, 50.0)
-"""Its azimuth, from +y towards +x, and elevation, degrees."""
+"""Azimuth of the sun, from +y towards +x, and its elevation, degrees."""
 
 STATIONS = [(1.2, -4.2), (2.6, -4.6), (4.4, -4.4), (5.7, -4.2), (6.2, -3.0), (6.2, -1.7), (5.4, -0.9), (4.0, -0.9)]
 STATIONS += [(2.7, -0.9), (1.4, -1.2), (0.9, -2.3), (0.9, -3.3)]
 TARGETS = [(3.4, 0.0, 1.1), (3.4, 0.0, 1.0), (2.4, 0.0, 1.1), (0.4, -0.6, 1.0), (0.0, -3.0, 1.2), (0.0, -6.0, 1.2)]
 TARGETS += [(2.4, -7.0, 1.3), (3.8, -7.0, 1.3), (5.6, -7.0, 1.3), (7.5, -5.4, 1.3), (9.0, -3.8, 1.3), (8.0, -1.2, 1.2)]
-"""The way of the photographer round the table, and what is looked at from each place."""
+"""Positions of the photographer around the table, and the target of the view from each."""
 
 STONE = (0.62, 0.60, 0.56)
 
 
 def house(seed: int) -> list[Part]:
-    """Two plastered walls with eaves and roofs, a door, a window, a gutter with its pipe, a lamp."""
+    """Return two plastered walls with eaves and roofs, a door, a window, a gutter with its pipe, a lamp."""
     plaster = Material(color=textures.speckled((0.84, 0.80, 0.72), (1024, 1024), 0.008, seed))
     stone = Material(color=textures.speckled(STONE, (512, 512), 0.06, seed + 3))
     tiles = Material(color=textures.brick(1024, seed + 5))
@@ -57,7 +57,7 @@ def house(seed: int) -> list[Part]:
     base = Material(color=(0.50, 0.48, 0.45))
 
     def side(length: float, openings: Sequence, low: float, high: float, roof: tuple[float, float]) -> list[Part]:
-        """A wall, made for y = 0, with eaves from x = low to high and a roof."""
+        """Return a wall in the plane y = 0, with eaves from x = low to high and a roof."""
         return [
             wall("plaster", (0.0, length), (0.0, EAVES + 0.1), openings, plaster, 2.5),
             box("eaves", (low, -0.4, EAVES), (high, 0.0, EAVES + 0.1), WHITE, sides="xXyz"),
@@ -88,7 +88,7 @@ def house(seed: int) -> list[Part]:
 
 
 def garden(seed: int) -> list[Part]:
-    """The paving, a low wall round it with an opening, lawn, hedge, and some shrubs."""
+    """Return the paving, a low wall around it with an opening, lawn, hedge, and some shrubs."""
     rng = np.random.default_rng([seed, 41])
     slabs = Material(color=textures.paving(1024, seed))
     grass = Material(color=textures.speckled((0.33, 0.41, 0.18), (2048, 2048), 0.13, seed + 1, broad=0.5))
@@ -117,13 +117,13 @@ def garden(seed: int) -> list[Part]:
 
 
 def slats(name: str, ends: Sequence, wood: Material, rng: np.random.Generator) -> Part:
-    """Boards from lower to upper corner, each of another piece of the wood."""
+    """Return boards between lower and upper corners, each with another part of the wood texture."""
     boards = [box(name, low, high, wood, tile=1.2) for low, high in ends]
     return joined(name, [replace(part, uv=part.uv + rng.uniform(size=2)) for part in boards if part.uv is not None])
 
 
 def garden_chair(wood: Material, rng: np.random.Generator) -> list[Part]:
-    """A chair of steel tubes 18 mm thick with slats, looked at from the front along +y, its back 88 cm high."""
+    """Return a chair of steel tubes 18 mm thick with slats, its front facing -y, its back 88 cm high."""
     steel, parts = Material("plastic", (0.13, 0.14, 0.14), 0.2), []
     for x in (-0.22, 0.22):
         frame = [(x, -0.26, 0.0), (x, -0.23, 0.40), (x, -0.20, 0.43), (x, 0.18, 0.41), (x, 0.21, 0.44), (x, 0.34, 0.88)]
@@ -139,7 +139,7 @@ def garden_chair(wood: Material, rng: np.random.Generator) -> list[Part]:
 
 
 def slatted_table(wood: Material, rng: np.random.Generator) -> Part:
-    """A table of 1.5 by 0.86 m over the origin, its top of boards with gaps of 1 cm."""
+    """Return a table of 1.5 by 0.86 m over the origin, its top of boards with gaps of 1 cm."""
     ends = [((-0.75, y, TOP - 0.025), (0.75, y + 0.086, TOP)) for y in np.linspace(-0.43, 0.344, 9)]
     ends += [((x, -0.38, TOP - 0.085), (x + 0.06, 0.38, TOP - 0.025)) for x in (-0.66, -0.03, 0.60)]
     ends += [((-0.60, y, TOP - 0.095), (0.60, y + 0.022, TOP - 0.027)) for y in (-0.37, 0.348)]
@@ -148,7 +148,7 @@ def slatted_table(wood: Material, rng: np.random.Generator) -> Part:
 
 
 def potted(place, radius: float, tall: float, tone, rng: np.random.Generator) -> list[Part]:
-    """A pot of clay with a bush that is `tall` above it."""
+    """Return a clay pot with a bush that is `tall` above it."""
     clay, earth = Material(color=(0.64, 0.40, 0.29)), Material(color=(0.19, 0.15, 0.12))
     high = 1.7 * radius
     rim = [(0.0, 0.0), (0.68 * radius, 0.0), (0.93 * radius, 0.84 * high), (radius, 0.84 * high), (radius, high)]
@@ -162,7 +162,7 @@ def potted(place, radius: float, tall: float, tone, rng: np.random.Generator) ->
 
 
 def furniture(subject: TexturedMesh, seed: int) -> list[Part]:
-    """The table with what stands on it, two chairs, pots, a mat."""
+    """Return the table with the things on it, two chairs, pots, a mat."""
     rng = np.random.default_rng([seed, 42])
     wood = Material("plastic", textures.wood((1024, 1024), 6, seed, color=(0.56, 0.41, 0.28)), 0.3)
     things = [
@@ -190,7 +190,8 @@ def furniture(subject: TexturedMesh, seed: int) -> list[Part]:
 
 
 def terrace_backdrop(seed: int) -> list[Part]:
-    """What is beyond the hedge: meadow, trees from 12 m on, houses from 45 m on, hills up to 340 m away."""
+    """Return the surroundings beyond the hedge: meadow, trees from 12 m on, houses from 45 m on, hills up to 340 m
+    away."""
     rng = np.random.default_rng([seed, 45])
     meadow = Material(color=textures.speckled((0.38, 0.45, 0.21), (1024, 1024), 0.12, seed + 6))
     parts = [quad("meadow", (-90, -90, -0.9), (180, 0, 0), (0, 180, 0), meadow, tile=30.0), outdoors.hills(seed)]
@@ -211,12 +212,12 @@ def terrace_backdrop(seed: int) -> list[Part]:
 
 
 def terrace_scene(subject: TexturedMesh, seed: int) -> Stage:
-    """The stage; `subject` is a figurine 30 cm high on the table, z up."""
+    """Return the stage; `subject` is a figurine 30 cm high on the table, z up."""
     return Stage([*house(seed), *garden(seed), *furniture(subject, seed)], sky=outdoors.day(seed, SUN))
 
 
 def terrace_poses(views: int, test_views: int, seed: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Training and held-out (4, 4) world-to-camera poses of somebody who walks once round the table: first looking at
-    the house, then at the garden."""
+    """Return training and held-out (4, 4) world-to-camera poses of a walk once around the table, looking first at the
+    house, then at the garden."""
     feet = np.insert(np.array(STATIONS), 2, 0.0, axis=1)
     return camera_paths.walk(feet, np.array(TARGETS), views, test_views, seed)

@@ -1,4 +1,4 @@
-"""Bitmap textures drawn by code from a seed: wood, paper covers, brick, plaster, paving. All are (H, W, 3) uint8."""
+"""Procedural bitmap textures from a seed: wood, book covers, brick, plaster, paving. All are (H, W, 3) uint8."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 
 def _smooth(rng: np.random.Generator, shape: tuple[int, int], sigma) -> np.ndarray:
-    """Gaussian noise of unit variance with a correlation length in texels, repeating at the edges."""
+    """Return Gaussian noise of unit variance, smoothed by a Gaussian of `sigma` texels per axis, periodic."""
     across, along = np.broadcast_to(sigma, 2)
     frequency = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
     passed = np.exp(-2.0 * np.pi**2 * ((across * frequency[0]) ** 2 + (along * frequency[1]) ** 2))
@@ -16,18 +16,19 @@ def _smooth(rng: np.random.Generator, shape: tuple[int, int], sigma) -> np.ndarr
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, ...], sigma, mode: str = "wrap") -> np.ndarray:
-    """Gaussian noise of unit variance as `_smooth`, but of any number of axes and with other edges, as of a cloth."""
+    """Return Gaussian noise as `_smooth`, but with any number of axes and with a choice of boundary mode."""
     field = gaussian_filter(rng.standard_normal(shape), sigma, mode=mode)
     return field / field.std()
 
 
 def to_bytes(color: np.ndarray) -> np.ndarray:
-    """A colour in [0, 1] as texels, neither quite black nor white."""
+    """Return a colour in [0, 1] as texels, limited to avoid black and white."""
     return (np.clip(color, 0.02, 0.97) * 255.0 + 0.5).astype(np.uint8)
 
 
 def speckled(color, shape: tuple[int, int], strength: float, seed: int, *, broad: float = 0.5) -> np.ndarray:
-    """Stone, plaster or concrete: one colour with grain of 1, 4 and 16 texels and a broad drift, all of `strength`."""
+    """Return stone, plaster or concrete: one colour with grain of 1, 4 and 16 texels and a broad drift, all scaled by
+    `strength`."""
     rng = np.random.default_rng([seed, 11])
     grain = sum(weight * _smooth(rng, shape, size) for size, weight in ((0.7, 0.5), (2.0, 0.6), (8.0, 0.6)))
     drift = broad * _smooth(rng, shape, min(shape) / 12.0)
@@ -35,7 +36,7 @@ def speckled(color, shape: tuple[int, int], strength: float, seed: int, *, broad
 
 
 def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24)) -> np.ndarray:
-    """Planks along u: grain, growth rings that bend, knots, and dark seams."""
+    """Return planks along u: grain, growth rings that bend, knots, and dark seams."""
     rng = np.random.default_rng([seed, 12])
     height, width = shape
     v, u = np.meshgrid(np.arange(height) / height, np.arange(width) / width, indexing="ij")
@@ -48,7 +49,7 @@ def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24
     light = 0.10 * rings + 0.07 * fibre + 0.04 * fine + rng.uniform(-0.12, 0.12, planks)[plank]
     for _ in range(3 * planks):
         x, y, radius = rng.uniform(), rng.uniform(), rng.uniform(0.006, 0.014)
-        # Beyond 12 radii nothing is left of a knot.
+        # A knot has no visible effect beyond 12 radii.
         rows = slice(max(0, int((y - 12 * radius) * height)), int((y + 12 * radius) * height) + 1)
         reach = 24.0 * radius * height / width
         part = rows, slice(max(0, int((x - reach) * width)), int((x + reach) * width) + 1)
@@ -61,12 +62,12 @@ def wood(shape: tuple[int, int], planks: int, seed: int, color=(0.56, 0.38, 0.24
 
 
 def cover(shape: tuple[int, int], seed: int, color=(0.16, 0.28, 0.42)) -> np.ndarray:
-    """A printed book cover: a picture of overlapping discs, lines of lettering, a frame."""
+    """Return a printed book cover: overlapping discs, lines of lettering, a frame."""
     from PIL import Image, ImageDraw
 
     rng = np.random.default_rng([seed, 13])
     height, width = shape
-    # Drawn at twice the size, then halved: smooth edges.
+    # Drawn at twice the size and then halved, for smooth edges.
     picture = Image.new("RGB", (2 * width, 2 * height), tuple(int(255 * c) for c in color))
     draw = ImageDraw.Draw(picture)
     for _ in range(60):
@@ -93,14 +94,14 @@ def cover(shape: tuple[int, int], seed: int, color=(0.16, 0.28, 0.42)) -> np.nda
 
 
 def bands(shape: tuple[int, int], colors, edges) -> np.ndarray:
-    """Stripes of constant v: color i reaches up to v = edges[i]."""
+    """Return stripes of constant v: colour i reaches up to v = edges[i]."""
     v = 1.0 - (np.arange(shape[0]) + 0.5) / shape[0]
     row = np.asarray(colors)[np.minimum(np.searchsorted(edges, v), len(colors) - 1)]
     return to_bytes(np.repeat(row[:, None], shape[1], axis=1))
 
 
 def brick(texels: int, seed: int, courses: int = 16, per_course: int = 5) -> np.ndarray:
-    """A square of running bond: bricks that differ in tone, rough faces, light mortar; repeats at the edges."""
+    """Return a square of running bond, periodic: bricks of different tones with rough faces, light mortar."""
     rng = np.random.default_rng([seed, 14])
     shape = (texels, texels)
     row, column = np.meshgrid(np.arange(texels) + 0.5, np.arange(texels) + 0.5, indexing="ij")
@@ -121,7 +122,7 @@ def brick(texels: int, seed: int, courses: int = 16, per_course: int = 5) -> np.
 
 
 def paving(texels: int, seed: int, rows: int = 6, per_row: int = 4) -> np.ndarray:
-    """A square of stone slabs with dark joints, stains and grit."""
+    """Return a square of stone slabs with dark joints, stains and grit."""
     rng = np.random.default_rng([seed, 15])
     shape = (texels, texels)
     row, column = np.meshgrid(np.arange(texels) + 0.5, np.arange(texels) + 0.5, indexing="ij")
