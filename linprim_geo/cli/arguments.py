@@ -1,4 +1,4 @@
-"""What the parsed command line says: options as dataclasses, which of them were given, effects, workers, budget."""
+"""Converts parsed arguments: options as dataclasses, the names of given options, effects, workers, time budget."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from collections.abc import Callable, Iterator
 from linprim_geo.base import cores
 from linprim_geo.base.errors import LinprimError
 
-# By which libraries are told how many threads to have.
+# Environment variables that set the number of threads of libraries.
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 
 
 def from_args(options: type, parsed: argparse.Namespace):
-    """The dataclass `options` filled from the arguments that `add_options` has added."""
+    """Return the dataclass `options` filled from the arguments added by `add_options`."""
     return options(**{name: getattr(parsed, name) for name in given_options(options, parsed)})
 
 
 def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
-    """Names of the fields of `options` that the command line sets."""
+    """Return the names of the fields of `options` that the command line sets."""
     return [field.name for field in dataclasses.fields(options) if hasattr(parsed, field.name)]
 
 
 def effects_choice(parsed: argparse.Namespace):
-    """What the command line says about effects. Who resumes a run has chosen before."""
+    """Return the choice of effects on the command line; by default none for a resumed run, whose effects are chosen."""
     from linprim_geo.base.options import SceneOptions, TrainOptions
     from linprim_geo.training.effects import Choice, parse_asked
 
@@ -37,7 +37,7 @@ def effects_choice(parsed: argparse.Namespace):
 
 
 def blocks_and_workers(parsed: argparse.Namespace) -> dict:
-    """--blocks, --cluster and --workers as keywords."""
+    """Return --blocks, --cluster and --workers as keywords."""
     alone = parsed.blocks == 1 and not getattr(parsed, "resume", False)
     for name in ("cluster", "workers"):
         if alone and (value := getattr(parsed, name)):
@@ -48,8 +48,8 @@ def blocks_and_workers(parsed: argparse.Namespace) -> dict:
 
 
 def time_budget(parsed: argparse.Namespace) -> dict:
-    """`time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; nothing
-    without it."""
+    """Return `time_budget` from --time-budget as a keyword, counted from now, before large libraries are loaded; {} if
+    it is not given."""
     if parsed.time_budget is None:
         return {}
     from linprim_geo.base.budget import Budget
@@ -59,15 +59,15 @@ def time_budget(parsed: argparse.Namespace) -> dict:
 
 @contextlib.contextmanager
 def limited_threads(count: int) -> Iterator[None]:
-    """In the block everything has so many threads: what asks for `usable_cores`, and libraries that are yet to be
-    loaded. 0 leaves all as it is."""
+    """Limit the threads in the block to `count`, for code that calls `usable_cores` and for libraries that are loaded
+    later; 0 changes nothing."""
     if not count:
         yield
         return
     before = {name: os.environ.get(name) for name in _THREADS}
     cores.limit = count
     os.environ.update(dict.fromkeys(_THREADS, str(count)))
-    # Loaded already where Python calls this, not where a shell does.
+    # These are already loaded when Python calls this, but not when a shell does.
     ops, torch = (sys.modules.get(name) for name in ("linprim_geo.kernels.ops", "torch"))
     loaded = (ops.threads(), torch.get_num_threads()) if ops and torch else None
     if ops and torch:
@@ -83,5 +83,5 @@ def limited_threads(count: int) -> Iterator[None]:
 
 
 def log(parsed: argparse.Namespace) -> Callable[[str], None]:
-    """What prints a line of progress, or nothing with --quiet."""
+    """Return a function that prints a line of progress to stderr, or nothing with --quiet."""
     return (lambda text: None) if parsed.quiet else (lambda text: print(text, file=sys.stderr))

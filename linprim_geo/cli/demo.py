@@ -15,10 +15,10 @@ SIZES = {"small": (40, 160, 1500, 2000), "normal": (60, 320, 7000, 5000)}
 
 
 def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = False) -> dict:
-    """Makes OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html,
-    says on stderr what it does.
+    """Create OUTPUT/scene (images, depth, reference mesh), OUTPUT/run (trained, meshed, scored) and OUTPUT/report.html,
+    with progress messages on stderr.
 
-    Replaces what an earlier demo left in `output`; any other folder there is refused.
+    Replaces the results of an earlier demo in `output`; any other existing content is rejected.
 
     Returns: `psnr`, `ssim`, `views` (held out), `chamfer_percent_diagonal`, `f1`, `abs_rel`, `normal_mean_deg`,
     `seconds`, `primitives`, and the paths.
@@ -87,7 +87,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
 
 
 def describe(result: dict) -> str:
-    """The result of `run_demo` as text for a person."""
+    """Return the result of `run_demo` as readable text."""
     return (
         f"\nPSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.4f} on {result['views']} held-out views; "
         f"depth AbsRel {result['abs_rel']:.4f}, normals {result['normal_mean_deg']:.1f} degrees off\n"

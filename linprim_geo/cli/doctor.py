@@ -1,5 +1,5 @@
-"""What `linprim-geo doctor` finds: versions, cores, memory, instruction set, libraries, and what to do about
-them."""
+"""The checks of `linprim-geo doctor`: versions, cores, memory, instruction set, libraries, and remedies for
+problems."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from linprim_geo.base.cores import core_quota, usable_cores
 from linprim_geo.base.system import compiler_problem, find_compiler, install_command, missing_libraries, python_problem
 from linprim_geo.base.version import __version__
 
-# Module, and the distributions that may have brought it. The bare `embreex` is an empty package.
+# Module, and the distributions that may provide it. The bare `embreex` is an empty package.
 LIBRARIES = (
     ("torch", ("torch",)),
     ("numpy", ("numpy",)),
@@ -36,22 +36,21 @@ LIBRARIES = (
     ("embreex.rtcore_scene", ("embreex",)),
 )
 
-# Below this a training of the default size starts to swap.
+# Free memory below which a training of the default size starts to swap.
 LITTLE_MEMORY = 4 << 30
 LITTLE_DISK = 2 << 30
 
 
 def doctor() -> dict:
-    """Imports every library and looks at the machine.
+    """Import every library and examine the machine.
 
     Returns:
-        `version`, `python`, `platform`, `container` (its kind, None in none that can be told), `cores` (that this
-        process may use), `machine_cores`, `core_quota` (cores' worth of time that its control groups allow, None
-        without such a limit), `memory_bytes` (that it may take), `machine_memory_bytes`, `memory_available_bytes`,
-        `disk_free_bytes`, `cache` (folder of undistorted images and triangulated points; None without numpy),
-        `cache_bytes` (what it holds), `compiler`, `instruction_set` (None
-        without the core), `libraries` ({module: version, or None if it cannot be imported}),
-        `missing_system_libraries`, and `problems`: one sentence each that says what to do; empty if
+        `version`, `python`, `platform`, `container` (its kind; None outside of containers, or if unknown), `cores`
+        (that this process may use), `machine_cores`, `core_quota` (of its control groups, in cores; None without such a
+        limit), `memory_bytes` (that it may use), `machine_memory_bytes`, `memory_available_bytes`, `disk_free_bytes`,
+        `cache` (folder of undistorted images and triangulated points; None without numpy), `cache_bytes` (its size),
+        `compiler`, `instruction_set` (None without the core), `libraries` ({module: version, or None if it cannot be
+        imported}), `missing_system_libraries`, and `problems`: one sentence for each, with its remedy; empty if
         everything works.
     """
     problems = [problem for problem in (python_problem(),) if problem]
@@ -103,7 +102,7 @@ def doctor() -> dict:
 
 
 def describe(report: dict) -> str:
-    """The report of `doctor` as text for a person."""
+    """Return the report of `doctor` as readable text."""
     free = _gigabytes(report["memory_available_bytes"])
     libraries = [f"{name} {version or 'MISSING'}" for name, version in report["libraries"].items()]
     lines = [
@@ -124,7 +123,7 @@ def describe(report: dict) -> str:
 
 
 def _limits(report: dict) -> list[str]:
-    """What the machine has of which this process may use a part, and why."""
+    """Return lines on the machine's resources of which this process may use only a part, with the cause."""
     lines = [] if report["container"] is None else [f"container: {report['container']}"]
     if report["core_quota"] is not None:
         lines.append(f"quota: {report['core_quota']:g} of the machine's {report['machine_cores']} cores")
@@ -137,7 +136,8 @@ def _limits(report: dict) -> list[str]:
 
 
 def _memory() -> tuple[int | None, int | None, int | None]:
-    """Memory that may be taken, that is available, and that the machine has, in bytes; None where psutil is missing."""
+    """Return memory that may be used, memory that is available, and the machine's memory, in bytes; None without
+    psutil."""
     from linprim_geo.base.memory import available_memory, total_memory
 
     try:
@@ -149,14 +149,14 @@ def _memory() -> tuple[int | None, int | None, int | None]:
 
 
 def _library(module: str, distributions: tuple[str, ...]) -> tuple[str | None, str | None]:
-    """(version, None), or (None, what is wrong and what to do)."""
+    """Return (version, None), or (None, the problem and its remedy)."""
     found = None
     for name in distributions:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found = found or importlib.metadata.version(name)
     try:
         importlib.import_module(module)
-    except Exception as error:  # a broken library may raise anything, and the others are still to be looked at
+    except Exception as error:  # a broken library may raise anything; the other libraries are still checked
         name = module.split(".")[0]
         if found is None:
             pip = f"{Path(sys.executable).name} -m pip install {distributions[0]}"
@@ -186,7 +186,7 @@ def _cache_folder() -> Path | None:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether files can be made in `folder`, or the folder itself where its first existing parent is."""
+    """Return whether files can be created in `folder`, or the folder itself below its first existing parent."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     return folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)

@@ -1,8 +1,8 @@
-"""The command `linprim-geo`: its commands, and how a result or a failure is reported.
+"""The command `linprim-geo`: its commands, and the reporting of results and failures.
 
-Only the standard library is imported here, the rest where a command runs, so that `--help` stays instant.
-Exit status: 0 the thing asked for was made, 1 the input cannot be used, 2 the arguments are wrong, 70 an
-error in this program, 130 interrupted, 141 the reader of the output went away.
+Only the standard library is imported here, the rest when a command runs, so that `--help` is immediate.
+Exit status: 0 success, 1 unusable input, 2 wrong arguments, 70 an error in this program, 130 interrupted, 141 the
+reader of the output has closed it.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from linprim_geo.cli.output import Output, printing
 
 EXIT_UNUSABLE, EXIT_INTERNAL, EXIT_INTERRUPTED, EXIT_PIPE = 1, 70, 130, 141
 
-# Files in linprim_geo/cli/commands, in the order of the help.
+# Modules of linprim_geo/cli/commands, in the order of the help.
 COMMANDS = "train inspect render extract stereo evaluate show tradeoff synth convert installation".split()
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command line and returns its exit status; argparse itself leaves with 0 (--help) or 2."""
-    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in a loop: on a busy machine many
-    # times the work.
+    """Run one command line and return its exit status; argparse itself exits with 0 (--help) or 2."""
+    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in busy loops, which multiplies the
+    # work on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # The two flags are known before and after the subcommand, so neither parser may set a default for them.
+    # --json and --debug are allowed before and after the subcommand, so neither parser may set a default for them.
     parsed, unknown = build_parser().parse_known_args(arguments)
     if unknown:
         parsed.command_parser.refuse(unknown)
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print_output(output)
         return output.status
     except BrokenPipeError:
-        # Nothing more can be printed; without this the interpreter would complain while it closes stdout.
+        # Nothing more can be printed. Without this, the interpreter would report an error when it closes stdout.
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def explain(error: BaseException) -> tuple[str, int]:
-    """The one sentence and the exit status for an error."""
+    """Return the error message, one sentence, and the exit status for an error."""
     if isinstance(error, LinprimError):
         return " ".join(str(error).split()), EXIT_UNUSABLE
     if isinstance(error, KeyboardInterrupt):
@@ -85,7 +85,7 @@ def explain(error: BaseException) -> tuple[str, int]:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says in one sentence what is wrong, and what may have been meant."""
+    """A parser whose error message is one sentence, with a suggestion of what may have been meant."""
 
     def error(self, message: str) -> NoReturn:
         if found := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
@@ -93,7 +93,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"linprim-geo: error: {message}; {self.prog} --help explains\n")
 
     def refuse(self, unknown: Sequence[str]) -> NoReturn:
-        """Arguments that nothing has taken."""
+        """Exit with an error about unrecognized arguments."""
         options = [option for action in self._actions for option in action.option_strings]
         self.error(f"unrecognized arguments: {' '.join(unknown)}{_meant(unknown[0].split('=')[0], options)}")
 
@@ -104,7 +104,7 @@ def _meant(given: str, possible: Sequence[str]) -> str:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The whole command line."""
+    """Return the parser of the whole command line."""
     common = Parser(add_help=False)
     group = common.add_argument_group("output")
     hidden = argparse.SUPPRESS
@@ -124,7 +124,7 @@ def build_parser() -> argparse.ArgumentParser:
     def command(name: str, run: Callable[[argparse.Namespace], Output], text: str) -> Parser:
         description = text[0].upper() + text[1:] + "."
         sub = subparsers.add_parser(name, parents=[common], help=text, description=description, allow_abbrev=False)
-        # `parser` for completion.
+        # `parser` is for completion.
         sub.set_defaults(run_command=run, parser=parser, command_parser=sub)
         return sub
 

@@ -1,4 +1,4 @@
-"""Arguments that several commands declare: options from dataclasses, effects, workers, and the types of values."""
+"""Arguments shared by several commands: options from dataclasses, effects, workers, and the types of values."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ AddCommand = Callable[[str, Callable[[argparse.Namespace], Output], str], argpar
 
 
 def add_options(parser: argparse._ActionsContainer, options: type) -> None:
-    """Adds one `--field-name` per field of the dataclass `options`, as `base.options.option` describes it."""
+    """Add one `--field-name` per field of the dataclass `options`, as declared by `base.options.option`."""
     kind_of = kinds(options)
     for field in dataclasses.fields(options):
         metadata, kind = field.metadata, kind_of[field.name]
-        # No default here, so that given options can be told from defaults.
+        # No defaults here, so that given options can be distinguished from defaults.
         settings: dict[str, Any] = {"dest": field.name, "default": argparse.SUPPRESS}
         settings["help"] = metadata["help"].replace("%", "%%") + _shown_default(field.default)
         if kind is bool:
@@ -46,7 +46,7 @@ def _shown_default(default: object) -> str:
 
 
 def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -> Callable[[str], Any]:
-    """What argparse makes a value by."""
+    """Return the function by which argparse converts a value."""
     if word:
         return number_or(word, kind)
     if parse is None:
@@ -62,7 +62,7 @@ def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -
 
 
 def add_effects(parser: argparse.ArgumentParser) -> None:
-    """Adds --effects and --effect, by which options are chosen that were not given."""
+    """Add --effects and --effect, which choose options that were not given."""
     group = parser.add_argument_group("effects")
     text = (
         "auto: what the data call for (default); none: the options as they are; all: everything on. An option that "
@@ -74,7 +74,7 @@ def add_effects(parser: argparse.ArgumentParser) -> None:
 
 
 def add_workers(parser: argparse.ArgumentParser, workers: int | None = 0) -> argparse._ArgumentGroup:
-    """Adds --cluster and --workers, of default `workers`, which say where the parts of a job are done."""
+    """Add --cluster and --workers (with the default `workers`), which set where the parts of a job run."""
     group = parser.add_argument_group("workers")
     text = (
         "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines "
@@ -87,29 +87,29 @@ def add_workers(parser: argparse.ArgumentParser, workers: int | None = 0) -> arg
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
-    """Adds --quiet."""
+    """Add --quiet."""
     parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
-    """Adds --threads to a command that has no options with it; `cli.main` heeds it."""
+    """Add --threads to a command whose options have none; `cli.main` applies it."""
     text = "worker threads; 0 uses every core; the result does not depend on it (default 0)"
     parser.add_argument("--threads", dest="most_threads", type=threads, default=0, metavar="N", help=text)
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
-    """Adds the folder of a run."""
+    """Add the argument for the folder of a run."""
     parser.add_argument("run", metavar="RUN", help="folder that train has made")
 
 
 def add_scene(parser: argparse.ArgumentParser, **settings: Any) -> None:
-    """Adds the capture, as a folder or a video."""
+    """Add the argument for the capture, a folder or a video."""
     text = "folder of a capture, of plain photographs, or a video"
     parser.add_argument("scene", metavar="SCENE", help=text, **settings)
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:
-    """Adds --split."""
+    """Add --split."""
     parser.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
 
 
@@ -122,7 +122,7 @@ def number_or(word: str, kind: type = float) -> Callable[[str], float | str]:
         return word if text == word else kind(text)
 
     name = "whole number" if kind is int else "number"
-    parse.__name__ = f"{name}, or {word}:"  # as argparse puts it into its message
+    parse.__name__ = f"{name}, or {word}:"  # used by argparse in its error message
     return parse
 
 
@@ -148,7 +148,7 @@ def whole(text: str) -> int:
 
 
 def seconds(text: str) -> float:
-    """90, 90s, 5m or 1.5h as seconds."""
+    """Parse 90, 90s, 5m or 1.5h to seconds."""
     units = {"s": 1, "m": 60, "h": 3600}
     try:
         value = float(text[:-1]) * units[text[-1]] if text[-1:] in units else float(text)

@@ -1,4 +1,4 @@
-"""What a command gives back, and how it is printed."""
+"""The result of a command, and its printing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Output:
-    """The result, which --json prints; the text for people, else a line for each plain value; the exit status."""
+    """The result, which --json prints; the text for people, or None for one line per plain value; the exit status."""
 
     result: dict
     text: str | None = None
@@ -21,9 +21,9 @@ class Output:
 
 @contextlib.contextmanager
 def printing(as_json: bool) -> Iterator[Callable[[Output], None]]:
-    """Yields a function that prints the output; with `as_json` whatever else goes to stdout goes to stderr.
+    """Yield a function that prints the output; with `as_json` everything else on stdout is redirected to stderr.
 
-    Libraries print from C as well, so the file descriptor is redirected, not only Python's stream.
+    The file descriptor is redirected too, not only Python's stream, as libraries also print from C.
     """
     if not as_json:
         yield _print_for_people

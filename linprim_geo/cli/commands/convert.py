@@ -1,4 +1,4 @@
-"""The command convert: files of primitives and meshes."""
+"""The command convert, for files of primitives and meshes."""
 
 from __future__ import annotations
 

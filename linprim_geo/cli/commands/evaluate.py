@@ -1,4 +1,4 @@
-"""The commands that score: eval-depth, eval-images and eval-mesh."""
+"""The scoring commands: eval-depth, eval-images and eval-mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command extract-mesh: a run to a triangle mesh."""
+"""The command extract-mesh: from a run to a triangle mesh."""
 
 from __future__ import annotations
 

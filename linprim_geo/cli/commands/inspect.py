@@ -1,4 +1,4 @@
-"""The command inspect: which effects a scene calls for."""
+"""The command inspect, which reports the effects that a scene needs."""
 
 from __future__ import annotations
 

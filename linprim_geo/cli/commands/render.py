@@ -1,4 +1,4 @@
-"""The command render: pictures of a run's views."""
+"""The command render: images of a run's views."""
 
 from __future__ import annotations
 

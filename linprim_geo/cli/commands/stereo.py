@@ -1,4 +1,4 @@
-"""The command stereo: photographs with poses to depth maps and a cloud of points."""
+"""The command stereo: from photographs with poses to depth maps and a point cloud."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command synth: photographs of a surface that is known."""
+"""The command synth: photographs of a known surface."""
 
 from __future__ import annotations
 

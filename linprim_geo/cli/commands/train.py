@@ -1,4 +1,4 @@
-"""The command train: photographs to a run of primitives."""
+"""The command train: from photographs to a run of primitives."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def run(parsed: argparse.Namespace) -> Output:
 
 
 def _downscale_of(resolution: int, scene: str, options: SceneOptions, threads: int, log) -> int | str:
-    """3DGS's -r as --downscale. Where it names a width, the least whole divisor that does not exceed it: pixels are
-    averaged."""
+    """Return 3DGS's -r as --downscale. For a width, it is the least whole divisor that does not exceed the width, as
+    pixels are averaged."""
     if resolution in (1, 2, 4, 8):
         return resolution
     if resolution == -1:
