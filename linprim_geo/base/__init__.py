@@ -1,1 +1,1 @@
-"""What every package needs: errors, files, options, progress, memory, time budgets."""
+"""Shared basics of all packages: errors, files, options, progress, memory, time budgets."""

@@ -1,5 +1,5 @@
-"""Arrays out of .npy and .npz files that are not to be trusted: what the header claims is checked before any memory is
-taken for it, for a few bytes may claim, and a few more may unpack to, an array of any size."""
+"""Reads arrays from untrusted .npy and .npz files. The shape and type in the header are checked before memory is
+allocated, as a few bytes may declare an array of any size, and a few more may decompress to one."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 
-# Headers of arrays of numbers take some hundred bytes. numpy reads one whole, whatever its length, before it looks.
+# Headers of numeric arrays have some hundred bytes. numpy reads a header whole, whatever its length, before checking
+# it.
 _LONGEST_HEADER = 10_000
 
-# Raises LinprimError unless an array of this shape and type is wanted.
+# Raises LinprimError if an array of this shape and type is not acceptable.
 Check = Callable[[tuple[int, ...], np.dtype], None]
 
 
 def read_array(path: str | os.PathLike, check: Check) -> np.ndarray:
-    """The array of a .npy file, or the first of an .npz file.
+    """Read the array of a .npy file, or the first array of an .npz file.
 
     Raises:
-        LinprimError: what `check` raises.
-        Exception: numpy and zipfile raise a dozen kinds for damaged files.
+        LinprimError: raised by `check`.
+        Exception: numpy and zipfile raise a dozen kinds of exceptions for damaged files.
     """
     if Path(path).suffix != ".npz":
         with open(path, "rb") as file:
@@ -39,8 +40,8 @@ def read_array(path: str | os.PathLike, check: Check) -> np.ndarray:
 
 
 def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, check: Check) -> np.ndarray:
-    """One array of an .npz file; errors as of `read_array`."""
-    # Other methods than numpy's take as much memory as the file asks for before they give a byte.
+    """Read one array of an .npz file; raises the same errors as `read_array`."""
+    # Other compression methods than numpy's allocate as much memory as the file demands before any output.
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{member.filename} is packed by the method {member.compress_type}")
     with archive.open(member) as file:
@@ -50,14 +51,14 @@ def read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, check: Check)
 
 
 def read_named(path: str | os.PathLike, wanted: Mapping[str, tuple[tuple[int | None, ...], str]]) -> list[np.ndarray]:
-    """Arrays of an .npz file that `numpy.savez` has written.
+    """Read arrays of an .npz file written by `numpy.savez`.
 
     Args:
-        wanted: name to shape, None where any length will do, and the letter of numpy's kinds: "f", "i", "u", "b".
+        wanted: by name the shape, with None for any length, and the letter of numpy's kind: "f", "i", "u", "b".
 
     Raises:
-        LinprimError: the file is missing or damaged, or an array is missing, of another shape or kind, or claims more
-            bytes than the file has.
+        LinprimError: the file is missing or damaged, or an array is missing, of another shape or kind, or declares
+            more bytes than the file has.
     """
     path = Path(path)
     try:
@@ -75,7 +76,7 @@ def read_named(path: str | os.PathLike, wanted: Mapping[str, tuple[tuple[int | N
 
 
 def _check_of(what: str, shape: tuple[int | None, ...], kind: str, size: int) -> Check:
-    """A check for an array of this shape and kind in a file of `size` bytes, which does not pack it."""
+    """Return a check for an array of this shape and kind in an uncompressed file of `size` bytes."""
 
     def check(claimed: tuple[int, ...], dtype: np.dtype) -> None:
         fits = len(claimed) == len(shape) and all(n in (None, found) for n, found in zip(shape, claimed, strict=True))
@@ -89,7 +90,7 @@ def _check_of(what: str, shape: tuple[int | None, ...], kind: str, size: int) ->
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type that the start of a .npy file claims."""
+    """Return the shape and type declared at the start of a .npy file."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"the array format is {version}")

@@ -1,4 +1,4 @@
-"""A time budget: the seconds that a command may take, and how much of them is left."""
+"""A time budget: the seconds that a command may take, and how many of them are left."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 
 from linprim_geo.base.errors import LinprimError
 
-# Share of a budget that is planned for: what is left ends the program and takes up what the correction comes too late
-# for.
+# Share of a budget that plans may use. The rest is for the end of the program, and for delays that planning notices too
+# late.
 AIM = 0.97
 
 
 @dataclass(frozen=True)
 class Budget:
-    """`seconds` of wall-clock time since `began`, a reading of time.monotonic()."""
+    """A budget of `seconds` of wall-clock time since `began`, a reading of time.monotonic()."""
 
     seconds: float
     began: float = field(default_factory=time.monotonic)
@@ -26,13 +26,13 @@ class Budget:
 
     @staticmethod
     def of(given: Budget | float | None) -> Budget | None:
-        """`given` itself, or a budget of so many seconds from now."""
+        """Return `given` itself, or a budget of so many seconds from now."""
         return given if given is None or isinstance(given, Budget) else Budget(float(given))
 
     def elapsed(self) -> float:
-        """Seconds since it began."""
+        """Return the seconds since its beginning."""
         return time.monotonic() - self.began
 
     def left(self) -> float:
-        """Seconds that may still be planned for; negative if there are none."""
+        """Return the seconds that plans may still use; negative if there are none."""
         return AIM * self.seconds - self.elapsed()

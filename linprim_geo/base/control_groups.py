@@ -1,4 +1,4 @@
-"""The control groups of this process on Linux, by which containers and services limit memory and cores."""
+"""The control groups (cgroups) of this process on Linux, by which containers and services limit memory and cores."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ MACHINE = Path("/")
 
 
 def group_folders(controller: str, root: Path = MACHINE) -> list[Path]:
-    """Folders with the limits of a controller ("memory", "cpu") on this process: its own group first, then the groups
-    above it, up to the root of the hierarchy. Empty where there are no control groups.
+    """Return the folders with the limits of a controller ("memory", "cpu") on this process: its own group first, then
+    the groups above it, up to the root of the hierarchy. Empty if there are no control groups.
 
-    Version 1 mounts a hierarchy per controller, version 2 one for all. A container that sees only its own part of the
-    hierarchy finds its group at the root, while the name in /proc may be that of the host: names without a folder are
-    passed over.
+    Version 1 mounts a hierarchy per controller, version 2 one for all. In a container that sees only its own part of
+    the hierarchy, the group is at the root, while its name in /proc may be the one on the host: names without a folder
+    are skipped.
     """
     mounts = root / "sys/fs/cgroup"
     try:
@@ -29,7 +29,7 @@ def group_folders(controller: str, root: Path = MACHINE) -> list[Path]:
         _, controllers, name = row
         if controllers and controller not in controllers.split(","):
             continue
-        # Controllers that share a hierarchy are mounted under both names; a link by one name may be missing.
+            # Controllers that share a hierarchy are mounted under both names; the link for one name may be missing.
         mount = mounts / controllers
         if controllers and (mounts / controller).is_dir():
             mount = mounts / controller
@@ -40,7 +40,8 @@ def group_folders(controller: str, root: Path = MACHINE) -> list[Path]:
 
 
 def container(root: Path = MACHINE) -> str | None:
-    """The kind of container that this process is in, as it says itself; None in none, or one that does not say."""
+    """Return the kind of container of this process, if the container declares it; None outside of containers, and in
+    others."""
     for name, file in (("docker", ".dockerenv"), ("podman", "run/.containerenv")):
         if (root / file).exists():
             return name
@@ -52,8 +53,8 @@ def container(root: Path = MACHINE) -> str | None:
 
 
 def read_number(file: Path, entry: str = "") -> int | None:
-    """The number in a file of a control group, or in its line `entry`; None if the file or line is missing, or says
-    "max"."""
+    """Return the number in a file of a control group, or in its line `entry`; None if the file or line is missing, or
+    is "max"."""
     with contextlib.suppress(OSError, ValueError):
         for line in file.read_text().splitlines():
             if not entry:

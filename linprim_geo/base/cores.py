@@ -9,15 +9,15 @@ from pathlib import Path
 
 from linprim_geo.base.control_groups import MACHINE, group_folders, read_number
 
-# What --threads of this command allows, 0 without it.
+# The limit set by --threads of the running command, 0 if unset.
 limit = 0
 
 
 def usable_cores(root: Path = MACHINE) -> int:
-    """Cores that this process may use, at least 1: the affinity mask, the quota of its container rounded up, and
-    --threads.
+    """Return the number of cores that this process may use, at least 1: the minimum of the affinity mask, the quota of
+    its container rounded up, and --threads.
 
-    `root` holds the system's /proc and /sys.
+    `root` contains the system's /proc and /sys.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = core_quota(root)
@@ -25,12 +25,12 @@ def usable_cores(root: Path = MACHINE) -> int:
 
 
 def core_quota(root: Path = MACHINE) -> float | None:
-    """Cores' worth of time that the control groups of this process allow it, None without such a limit."""
+    """Return the core quota of the control groups of this process, in cores; None without such a limit."""
     found = []
     for folder in group_folders("cpu", root):
         quota, period = read_number(folder / "cpu.cfs_quota_us"), read_number(folder / "cpu.cfs_period_us")
         with contextlib.suppress(OSError, ValueError):
             quota, period = (int(word) for word in (folder / "cpu.max").read_text().split())
-        if quota and period and quota > 0 and period > 0:  # version 1 says -1 for no quota
+        if quota and period and quota > 0 and period > 0:  # version 1 uses -1 for no quota
             found.append(quota / period)
     return min(found, default=None)

@@ -1,20 +1,20 @@
-"""The one exception a user is meant to read: a single sentence, shown without a traceback."""
+"""The exception whose message is for users: a single sentence, shown without a traceback."""
 
 from __future__ import annotations
 
 
 def printable(text: str) -> str:
-    """`text` with ? for each character that is not to be shown: what is between them may be an order to a terminal."""
+    """Return `text` with ? for each non-printable character, which might be part of a terminal control sequence."""
     return "".join(character if character.isprintable() or character == "\n" else "?" for character in text)
 
 
 class LinprimError(Exception):
-    """Something the user gave cannot be used.
+    """Input from the user that cannot be used.
 
-    The message is one sentence that names the file, row or option, what was found there and what was wanted.
-    The command line prints it and exits with status 1; `--debug` shows the traceback as well. Whatever a file or a
-    library has put into it, it is one line of at most LONGEST characters: line breaks become spaces, characters that
-    are not to be shown question marks, and the middle is left out of one that is longer.
+    The message is one sentence that names the file, row or option, what was found there and what was expected.
+    The command line prints it and exits with status 1; `--debug` also shows the traceback. The message is always one
+    line of at most LONGEST characters, whatever a file or a library has put into it: line breaks become spaces,
+    non-printable characters question marks, and the middle of a longer text is left out.
     """
 
     LONGEST = 1000
@@ -27,4 +27,4 @@ class LinprimError(Exception):
 
 
 class DiskFull(LinprimError):
-    """There is no space left on a device: nothing that could be done in another way."""
+    """No space is left on a device. No fallback can avoid this error."""

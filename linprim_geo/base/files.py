@@ -1,4 +1,4 @@
-"""Writing files so that what was there before is never lost and nothing half-written is left behind."""
+"""Writes files atomically: existing files are never lost, and no partial files are left."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ def _read_umask() -> int:
     return mask
 
 
-# Read once: the only way to ask for it is to change it, which other threads would see.
+# Read once, as reading it requires setting it, which other threads would notice.
 _UMASK = _read_umask()
 
 
-# What a full disk says, a quota, or a file system that takes no file of this size.
+# Errors of a full disk, of a quota, and of a file system that does not support files of this size.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCK = ".lock"
 _SECONDS_BETWEEN_TRIES = 0.2
-# What a file system says that knows no locks.
+# Errors of a file system without locks.
 _NO_LOCKS = (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK)
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
-    """Yields a temporary path beside `path` (same suffix) that replaces it when the block ends without an error.
+    """Yield a temporary path beside `path` (same suffix) that replaces it if the block ends without an error.
 
-    The data is on disk before the rename and the rename before this returns, so a crash at any moment leaves either the
-    old file or the new one, and files that are written one after the other are never lost the other way round. On an
-    error, or Ctrl-C, the temporary file is removed and the old file stays; `remove_temporary` removes what a kill
-    has left.
+    The data is on disk before the rename, and the rename before this returns. So a crash at any moment leaves either
+    the old or the new file, and of files written one after the other a later one never survives without an earlier
+    one. On an error or Ctrl-C, the temporary file is removed and the old file stays. `remove_temporary` removes what is
+    left by a killed process.
 
     Raises:
         LinprimError: the folder cannot be written.
@@ -71,7 +71,7 @@ def atomic_write(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def readable_write_errors(path: Path) -> Iterator[None]:
-    """Turns the errors of a disk that is full, fails or may not be written into one sentence about `path`."""
+    """Convert errors of a full, failing or read-only disk to a LinprimError about `path`."""
     try:
         yield
     except OSError as error:
@@ -79,7 +79,7 @@ def readable_write_errors(path: Path) -> Iterator[None]:
         if found is None:
             raise
         raise found from error
-    except RuntimeError as error:  # how torch reports a write that failed
+    except RuntimeError as error:  # torch raises this for a failed write
         cause = error.__cause__ or error.__context__
         found = _sentence(path, cause) if isinstance(cause, OSError) else None
         if found is None and not _disk_is_full(path.parent):
@@ -88,34 +88,34 @@ def readable_write_errors(path: Path) -> Iterator[None]:
 
 
 def remove_temporary(path: Path) -> None:
-    """Removes what writing `path` left behind when it was killed; only for who holds the lock of its folder."""
+    """Remove temporary files left by a killed process that wrote `path`; call it only with the folder locked."""
     for torn in path.parent.glob(f".{glob.escape(path.stem)}.*.tmp{glob.escape(path.suffix)}"):
         with contextlib.suppress(OSError):
             torn.unlink()
 
 
 def is_leftover(entry: Path) -> bool:
-    """Whether a directory entry is nothing but what `locked` or a killed `atomic_write` leaves."""
+    """Return whether a directory entry is a remainder of `locked` or of a killed `atomic_write`."""
     return entry.name.startswith(".") and (entry.name.endswith(_LOCK) or ".tmp" in entry.name) and entry.is_file()
 
 
 @contextlib.contextmanager
 def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] | None = None) -> Iterator[None]:
-    """Holds a folder, which is made if need be, or only the name `file` in it, against other processes.
+    """Lock a folder, which is created if necessary, or only the name `file` in it, against other processes.
 
-    The system lets go of it when this process ends, however it does; where the file system knows no locks there is
-    none. `what` goes into the sentence of those that are refused: "trained into". With `wait` nobody is refused: it is
-    called once, and the lock waited for.
+    The system releases the lock when this process ends for any reason. There is no lock on file systems without locks.
+    `what` is used in the error message of rejected processes, such as "trained into". With `wait`, a process is not
+    rejected: `wait` is called once, and then the lock is waited for.
 
     Raises:
-        LinprimError: another process holds it, or the folder cannot be written.
+        LinprimError: another process holds the lock, or the folder cannot be written.
     """
     for above in (folder, *folder.parents):
         if above.exists() and not above.is_dir():
             raise LinprimError(f"{above}: is a file, wanted a folder")
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / (f".{file}{_LOCK}" if file else _LOCK)
-    # Without flock filelock would take the mere existence of the file for a lock, which a kill leaves behind.
+    # Without flock, filelock would treat a mere file, which a killed process leaves, as a lock.
     lock, told = FileLock(path, fallback_to_soft=False), False
     with readable_write_errors(folder / file):
         while not lock.is_locked:
@@ -131,7 +131,7 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
                 if not told:
                     wait()
                     told = True
-            except FileNotFoundError:  # the process that held it has just removed the folder, which was empty
+            except FileNotFoundError:  # the previous holder has just removed the empty folder
                 continue
             except OSError as error:
                 if error.errno in _NO_LOCKS:
@@ -149,7 +149,7 @@ def locked(folder: Path, what: str, file: str = "", wait: Callable[[], object] |
 
 
 def _sync_folder(folder: Path) -> None:
-    """Puts the names in a folder on disk, where folders can be opened for that."""
+    """Write the entries of a folder to disk, on systems where folders can be opened for that."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -159,7 +159,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def check_room(folder: Path, size: int) -> None:
-    """Raises DiskFull unless so many bytes are free in a folder that there is."""
+    """Raise DiskFull unless `size` bytes are free in an existing folder."""
     if shutil.disk_usage(folder).free < size:
         raise DiskFull(f"{folder}: no space left on the device, wanted {size / 2**20:.0f} MiB")
 
@@ -185,8 +185,8 @@ def _sentence(path: Path, error: OSError) -> LinprimError | None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file, also for paths out of a file that no file can have: too long, or with characters that
-    are none."""
+    """Return whether a file exists. False for impossible paths from untrusted files: too long, or with invalid
+    characters."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -194,7 +194,7 @@ def is_file(path: Path) -> bool:
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is a folder, also for paths that no folder can have, see `is_file`."""
+    """Return whether a folder exists; False for impossible paths, see `is_file`."""
     try:
         return path.is_dir()
     except (OSError, ValueError):
@@ -202,10 +202,10 @@ def is_folder(path: Path) -> bool:
 
 
 def read_json(path: Path, wanted: str) -> object:
-    """The value in a JSON file.
+    """Return the value in a JSON file.
 
     Raises:
-        LinprimError: it cannot be read, or is no JSON; `wanted` ends the sentence: "a camera's intrinsics".
+        LinprimError: it cannot be read, or is not JSON; `wanted` ends the message, such as "a camera's intrinsics".
     """
     try:
         return json.loads(path.read_text(encoding="utf-8-sig"))
@@ -213,19 +213,19 @@ def read_json(path: Path, wanted: str) -> object:
         found = f"not valid JSON at line {error.lineno}, column {error.colno} ({error.msg})"
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
-    except (ValueError, RecursionError) as error:  # not UTF-8, or lists in lists without end
+    except (ValueError, RecursionError) as error:  # not UTF-8, or too deeply nested
         found = f"cannot be read ({error})"
     raise LinprimError(f"{path}: {found}, wanted {wanted}")
 
 
 def write_json(path: str | os.PathLike, value: object) -> None:
-    """Writes `value` as indented JSON, atomically. NaN and infinity become null, which JSON can hold."""
+    """Write `value` as indented JSON, atomically. NaN and infinity become null, as JSON has neither."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(json_ready(value), indent=2) + "\n")
 
 
 def _disk_is_full(folder: Path) -> bool:
-    """Whether less than a MiB is left; asked while the file that failed is still there."""
+    """Return whether less than a MiB is free. Called while the file whose writing failed still exists."""
     try:
         return shutil.disk_usage(folder).free < 2**20
     except OSError:
@@ -233,7 +233,7 @@ def _disk_is_full(folder: Path) -> bool:
 
 
 def json_ready(value: object):
-    """`value` as JSON can hold it: arrays and tuples become lists, paths and keys text, NaN and infinity null."""
+    """Return `value` in types of JSON: arrays and tuples become lists, paths and keys text, NaN and infinity null."""
     if isinstance(value, dict):
         return {str(key): json_ready(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

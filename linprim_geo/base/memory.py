@@ -1,4 +1,4 @@
-"""Memory of this process and of this machine, within the limits of its containers."""
+"""Memory use of this process and memory of this machine, within the limits of containers."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 
 from linprim_geo.base.control_groups import MACHINE, group_folders, read_number
 
-# What a process takes in any case, libraries above all, and each pixel of the image that is at work.
+# Memory of any process, mostly libraries, and of each pixel of the image being processed.
 PROCESS_GIB, PIXEL_BYTES = 0.45, 300
 # Files of a control group: limit, use, and the lines of memory.stat that count cached pages of files. Version 2 has two
-# limits; above the second a process is slowed down until it hardly moves. In version 1 the lines that begin with total_
-# include the groups below, as the use does.
+# limits; above the second, a process is slowed down until it hardly progresses. In version 1, lines with the prefix
+# total_ include the groups below, as the use does.
 _FILES = (
     ("memory.max", "memory.current", ("inactive_file", "active_file")),
     ("memory.high", "memory.current", ("inactive_file", "active_file")),
@@ -22,33 +22,34 @@ _FILES = (
 
 
 def available_memory(root: Path = MACHINE) -> int:
-    """Bytes of memory that can be taken without swapping, within the limits of the container if any.
+    """Return the bytes of memory available without swapping, within the limits of a container if any.
 
-    `root` holds the system's /proc and /sys with the control groups.
+    `root` contains the system's /proc and /sys with the control groups.
     """
-    import psutil  # 70 ms, which the start of the command line is spared
+    import psutil  # takes 70 ms, so not imported at the start of the command line
 
     return min([psutil.virtual_memory().available, *(free for _, free in _group_memory(root))])
 
 
 def total_memory(root: Path = MACHINE) -> int:
-    """Bytes of memory of this machine, or the limit of the container if that is less."""
+    """Return the bytes of memory of this machine, or the limit of the container if that is less."""
     import psutil
 
     return min([psutil.virtual_memory().total, *(limit for limit, _ in _group_memory(root))])
 
 
 def memory_gib() -> float:
-    """Resident memory of this process in GiB."""
+    """Return the resident memory of this process in GiB."""
     import psutil
 
     return psutil.Process().memory_info().rss / 2**30
 
 
 def peak_gib() -> float:
-    """The most resident memory of this process in GiB since `forget_peak`, or ever where Linux's /proc is missing.
+    """Return the peak resident memory of this process in GiB since `forget_peak`; since its start without Linux's
+    /proc.
 
-    psutil has no peak outside Windows.
+    psutil reports the peak on Windows only.
     """
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
@@ -63,21 +64,21 @@ def peak_gib() -> float:
 
 
 def forget_peak() -> None:
-    """Sets the peak that Linux keeps to what is resident now; elsewhere the peak stays the one since the start."""
+    """Reset the peak on Linux to the present resident memory; elsewhere the peak remains that since the start."""
     with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as file:
         file.write("5")
 
 
 def give_back() -> None:
-    """Returns freed memory to the system. glibc keeps it: after the first large array that is freed, others of up to
-    32 MiB come from its heap, which only shrinks from its end. Other allocators are left alone."""
+    """Return freed memory to the system. glibc keeps it: after the first large array is freed, others of up to 32 MiB
+    come from its heap, which shrinks only at its end. Other allocators are not affected."""
     with contextlib.suppress(OSError, TypeError, AttributeError):  # Windows has no CDLL(None)
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _group_memory(root: Path) -> list[tuple[int, int]]:
-    """(limit, free) in bytes of every control group of this process that has a limit; cached pages of files count as
-    free, since the system gives them up before it refuses memory."""
+    """Return (limit, free) in bytes of every control group of this process that has a limit. Cached pages of files
+    count as free, since the system drops them before it refuses memory."""
     found = []
     for folder in group_folders("memory", root):
         for limit_file, use_file, cached in _FILES:

@@ -1,5 +1,5 @@
-"""Every option of the long-running commands: name, default, unit and help in one place, so that the command line,
-the Python functions and a run's config.json cannot disagree."""
+"""All options of the long-running commands: name, default, unit and help in one place, so that the command line, the
+Python functions and a run's config.json are consistent."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.kinds import KINDS
 
 LONGEST_SIDE = 1600
-"""Pixels along the longer side of photographs that `downscale` auto leaves at most."""
+"""Largest longer side of photographs with `downscale` auto, pixels."""
 
 
 def option(
@@ -28,20 +28,20 @@ def option(
     number_or: str | None = None,
     parse: Callable[[str], Any] | None = None,
 ):
-    """A dataclass field that the command line turns into `--field-name` with `text` as its help.
+    """Return a dataclass field that the command line offers as `--field-name` with the help `text`.
 
-    Its value is at least `low` and at most `high`, or `positive`, or one of `choices`; `check` says so where it is not.
-    With `number_or` it holds a number or that word. With `parse` it holds what that makes of the flag's text, or raises
-    ValueError with a sentence; who uses it checks it. A bool is True where the flag is given, a tuple of text holds the
-    words after the flag.
+    Its value is at least `low` and at most `high`, or `positive`, or one of `choices`; `check` verifies this. With
+    `number_or` it is a number or that word. With `parse` it is the result of parsing the flag's text, or ValueError
+    with a sentence is raised; code that uses the value checks it. A bool is True if the flag is given; a tuple of text
+    holds the words after the flag.
     """
     metadata = {"help": text, "low": low, "high": high, "positive": positive, "choices": choices}
     return field(default=default, metadata=metadata | {"metavar": metavar, "number_or": number_or, "parse": parse})
 
 
 def kinds(cls: type) -> dict[str, type]:
-    """bool, int, float or str for each field of an options dataclass: its annotation without None and without the word
-    of `number_or`."""
+    """Return bool, int, float or str for each field of an options dataclass: its annotation without None and without
+    the word of `number_or`."""
     named = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(cls).items()}
     return {
         entry.name: next(kind for kind in (bool, int, float, str) if kind in named[entry.name]) for entry in fields(cls)
@@ -49,17 +49,17 @@ def kinds(cls: type) -> dict[str, type]:
 
 
 def flag_of(name: str) -> str:
-    """The flag of the command line for a field."""
+    """Return the command line's flag for a field."""
     return "--" + name.replace("_", "-")
 
 
 def changed_options(options) -> list[Field]:
-    """The fields of an options dataclass whose values differ from their defaults."""
+    """Return the fields of an options dataclass whose values differ from their defaults."""
     return [entry for entry in fields(options) if getattr(options, entry.name) != entry.default]
 
 
 def flags(options) -> list[str]:
-    """The words of a command line that set text, numbers and bools that differ from their defaults."""
+    """Return the words of a command line that set the text, numbers and bools that differ from their defaults."""
     words = []
     for entry in changed_options(options):
         flag, value = flag_of(entry.name), getattr(options, entry.name)
@@ -71,7 +71,7 @@ def flags(options) -> list[str]:
 
 
 def check(options) -> None:
-    """Raises LinprimError for the first option whose value is of another type, outside its range, or not one of its
+    """Raise LinprimError for the first option whose value has another type, is outside of its range, or not one of its
     choices."""
     kind_of = kinds(type(options))
     for entry in fields(options):
@@ -81,7 +81,7 @@ def check(options) -> None:
 
 
 def _wanted(value: Any, entry: Field, kind: type) -> str:
-    """What an option's value should be; "" if it is."""
+    """Return a description of the valid values of an option; "" if its value is valid."""
     choices, low, high = (entry.metadata[name] for name in ("choices", "low", "high"))
     if value is None and entry.default is None:
         return ""
@@ -106,7 +106,7 @@ def _wanted(value: Any, entry: Field, kind: type) -> str:
 
 
 def with_changes(cls: type, options, changes: dict[str, Any]):
-    """The dataclass `options`, or the defaults of `cls`, with some fields changed, and checked.
+    """Return the dataclass `options`, or the defaults of `cls`, with some fields changed, and checked.
 
     Raises:
         LinprimError: as `check`.
@@ -117,10 +117,10 @@ def with_changes(cls: type, options, changes: dict[str, Any]):
 
 
 def from_saved(cls: type, values: object, where: str):
-    """An options dataclass from what a file holds. Options that this version no longer has are ignored.
+    """Return an options dataclass from values of a file. Options that this version does not have are ignored.
 
     Raises:
-        LinprimError: not a table, or a value of another type than the option's.
+        LinprimError: `values` is not a table, or a value has another type than its option.
     """
     if not isinstance(values, dict):
         raise LinprimError(f"{where}: holds {type(values).__name__} in place of options")
@@ -146,7 +146,7 @@ def from_saved(cls: type, values: object, where: str):
 
 
 def check_train_options(options: TrainOptions) -> None:
-    """Raises LinprimError as `check`, and for two values that exclude each other."""
+    """Raise LinprimError as `check` does, and for two values that exclude each other."""
     check(options)
     if not KINDS[options.primitive].solid and options.order != "center":
         raise LinprimError(
@@ -161,11 +161,11 @@ def check_train_options(options: TrainOptions) -> None:
 
 
 def initial_count(options: TrainOptions, share: float) -> int:
-    """Primitives at the start, `share` of the most there may be unless --initial-primitives says."""
+    """Return the number of primitives at the start: --initial-primitives, or else `share` of the largest number."""
     return min(options.max_primitives, options.initial_primitives or max(500, round(share * options.max_primitives)))
 
 
-# Weights of the late terms of geometry_terms.py.
+# Names of the options with the weights of the terms of geometry_terms.py, which join the loss late.
 GEOMETRY_WEIGHTS = (
     "normal_consistency",
     "distortion",
@@ -177,7 +177,7 @@ GEOMETRY_WEIGHTS = (
 
 
 def raster_options(options: TrainOptions) -> dict:
-    """The keywords of `ops.rasterize` that say what a run's primitives are and how they are blended."""
+    """Return the keywords of `ops.rasterize` for a run's primitives and the way of blending them."""
     kind = KINDS[options.primitive]
     return {
         "primitive": options.primitive,
@@ -190,7 +190,7 @@ def raster_options(options: TrainOptions) -> dict:
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How a capture is read."""
+    """The settings for reading a capture."""
 
     pinhole_below: float = option(
         0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", low=0, metavar="PX"
@@ -235,7 +235,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How a scene is trained."""
+    """The settings for training a scene."""
 
     iterations: int = option(7000, "training steps, one view each", low=1, high=10**8)
     primitive: str = option("octahedron", "what the scene is made of", choices=tuple(KINDS))
@@ -341,7 +341,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class ExtractOptions:
-    """How a surface is taken out of a run."""
+    """The settings for extracting a surface from a run."""
 
     level: float | str = option(
         "auto",
@@ -451,7 +451,7 @@ class ExtractOptions:
 
 @dataclass(frozen=True)
 class StereoOptions:
-    """How dense stereo is done."""
+    """The settings of dense stereo."""
 
     least_confidence: float = option(
         0.5,

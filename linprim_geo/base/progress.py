@@ -1,4 +1,4 @@
-"""Progress of a long job: one line that is rewritten on a terminal, plain lines now and then in a log."""
+"""Progress of a long job: one line that is rewritten on a terminal, or plain lines at intervals in a log."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from linprim_geo.base.memory import forget_peak, give_back, peak_gib
 
 
 def duration(seconds: float) -> str:
-    """12 s, 3:04 or 1:02:03."""
+    """Format a duration as 12 s, 3:04 or 1:02:03."""
     whole = int(round(seconds))
     if whole < 60:
         return f"{whole} s"
@@ -19,10 +19,10 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Prints to stderr how far a job of `total` steps is, with rate and time left.
+    """Prints the progress of a job of `total` steps to stderr, with rate and time left.
 
-    On a terminal the line is refreshed twice a second; elsewhere a line is printed every 20 seconds. `quiet` prints
-    nothing.
+    On a terminal the line is refreshed twice a second; otherwise a line is printed every 20 seconds. With `quiet`
+    nothing is printed.
     """
 
     def __init__(self, name: str, total: int, start: int = 0, quiet: bool = False):
@@ -32,12 +32,12 @@ class Progress:
         self.restart(total, start)
 
     def restart(self, total: int, start: int = 0) -> None:
-        """Begins the clock again: rate and time left are those of the steps after `start`, from now on."""
+        """Restart the clock: rate and time left then refer to the steps after `start`, from now on."""
         self.total, self.start = total, start
         self.begin = self.last = time.monotonic()
 
     def update(self, done: int, text: str = "") -> None:
-        """Says that `done` steps are finished; `text` goes at the end of the line."""
+        """Report that `done` steps are finished; `text` is put at the end of the line."""
         now = time.monotonic()
         if self.quiet or now - self.last < (0.5 if self.terminal else 20.0):
             return
@@ -48,20 +48,21 @@ class Progress:
         self._show(f"{self.name} {done}/{self.total}  {pace}  {left} left  {text}")
 
     def stage(self, done: int, text: str) -> None:
-        """Says at once that step `done`, counted from 0, begins: of a few long ones that differ, so without a rate."""
+        """Report immediately that step `done`, counted from 0, begins, for jobs of a few long and different steps;
+        prints no rate."""
         if not self.quiet:
             self.last = time.monotonic()
             self._show(f"{self.name} {done + 1}/{self.total}  {text}")
 
     def note(self, text: str) -> None:
-        """Prints a line that stays."""
+        """Print a permanent line."""
         if self.quiet:
             return
         self.clear()
         _print(printable(text) + "\n")
 
     def clear(self) -> None:
-        """Removes the line that is being rewritten."""
+        """Remove the line that is being rewritten."""
         if self.terminal and self.width and not self.quiet:
             _print("\r" + " " * self.width + "\r")
             self.width = 0
@@ -75,7 +76,7 @@ class Progress:
 
 
 def _print(text: str) -> None:
-    """A log on a disk that is full ends no job; a pipe that nobody reads does."""
+    """Print to stderr. A full disk under the log does not end the job; a closed pipe does."""
     try:
         print(text, end="", file=sys.stderr, flush=True)
     except BrokenPipeError:
@@ -85,7 +86,7 @@ def _print(text: str) -> None:
 
 
 class Stages:
-    """Clock of a job made of named stages; `lap` ends the one that is running."""
+    """The clock of a job with named stages; `lap` ends the running stage."""
 
     def __init__(self, progress: Progress):
         self.progress = progress
@@ -95,12 +96,12 @@ class Stages:
         forget_peak()
 
     def note(self, text: str) -> None:
-        """Prints a line that stays, indented under its job."""
+        """Print a permanent line, indented below its job."""
         self.progress.note("  " + text)
 
     def lap(self, name: str) -> None:
-        """Ends the stage `name`: its seconds, and the largest resident memory of this process during it (0 where
-        unknown). What it has freed goes back to the system."""
+        """End the stage `name`: record its seconds and the largest resident memory of this process during it (0 if
+        unknown). Freed memory is returned to the system."""
         now = time.perf_counter()
         self.seconds[name] = round(self.seconds.get(name, 0.0) + now - self._begin, 3)
         self.peak_gib[name] = round(max(self.peak_gib.get(name, 0.0), peak_gib()), 3)
@@ -109,14 +110,14 @@ class Stages:
         forget_peak()
 
     def line(self) -> str:
-        """One printed line of what `report` returns."""
+        """Return one line of text with the values of `report`."""
         both = self.report()
         return ", ".join(
             f"{name} {both['seconds'][name]:.1f} s {both['peak_gib'][name]:.2f} GiB" for name in both["seconds"]
         )
 
     def report(self) -> dict:
-        """`seconds` and `peak_gib` per stage, each with the `total`: their sum and their largest."""
+        """Return `seconds` and `peak_gib` per stage, with the `total`: the sum and the maximum."""
         return {
             "seconds": self.seconds | {"total": round(sum(self.seconds.values()), 3)},
             "peak_gib": self.peak_gib | {"total": max(self.peak_gib.values(), default=0.0)},

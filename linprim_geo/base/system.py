@@ -1,7 +1,7 @@
-"""What the machine must offer before anything is installed: Python, a C++20 compiler, shared libraries.
+"""Requirements on the machine before an installation: Python, a C++20 compiler, shared libraries.
 
-Nothing but the standard library is used, and nothing of this package: `tools/check_system.py` loads this file
-by its path on a machine where nothing is installed yet, and `linprim-geo doctor` uses it afterwards.
+Only the standard library is used, and nothing of this package: `tools/check_system.py` loads this file by its path
+before anything is installed, and `linprim-geo doctor` uses it afterwards.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ OLDEST_PYTHON = (3, 11)
 
 @dataclass(frozen=True)
 class SystemLibrary:
-    """A shared library that a wheel links against but does not bring along, and the packages that hold it."""
+    """A shared library that a wheel links against but does not contain, and the system packages with it."""
 
     soname: str
     debian: str
@@ -38,7 +38,7 @@ LINUX_LIBRARIES = (
     SystemLibrary("libgmp.so.10", "libgmp10", "gmp", "pymeshlab"),
 )
 
-# Concepts, <span> and <bit> tell a C++20 compiler and library from older ones.
+# Concepts, <span> and <bit> exist only in C++20 compilers and libraries.
 _CXX20 = """
 #include <bit>
 #include <concepts>
@@ -49,7 +49,7 @@ int main() { const float x[1] = {0}; return int(first<float>(x)) + std::popcount
 
 
 def missing_libraries() -> list[SystemLibrary]:
-    """The shared libraries that the dynamic linker cannot load here; other systems than Linux need none."""
+    """Return the shared libraries that the dynamic linker cannot load; systems other than Linux need none."""
     if not sys.platform.startswith("linux"):
         return []
     missing = []
@@ -62,8 +62,7 @@ def missing_libraries() -> list[SystemLibrary]:
 
 
 def install_command(missing: list[SystemLibrary]) -> list[str] | None:
-    """The command that installs `missing` with this machine's package manager; None if that is not a known
-    one."""
+    """Return the command that installs `missing` with this machine's package manager; None if it is unknown."""
     if shutil.which("apt-get"):
         return [
             "apt-get",
@@ -78,8 +77,8 @@ def install_command(missing: list[SystemLibrary]) -> list[str] | None:
 
 
 def find_compiler() -> str | None:
-    """The C++ compiler that CMake will pick ($CXX, c++, g++, clang++) if it can build the core, else None."""
-    # The core has kernels for the newest of these levels, and older compilers do not know them by name.
+    """Return the C++ compiler that CMake will choose ($CXX, c++, g++, clang++) if it can build the core, else None."""
+    # The core has kernels for the newest of these levels, whose names older compilers do not know.
     levels = ["-march=x86-64-v4"] if platform.machine() in ("x86_64", "AMD64") else []
     names = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in names:
@@ -94,7 +93,7 @@ def find_compiler() -> str | None:
 
 
 def compiler_problem() -> str | None:
-    """One sentence that says what is wrong with the compiler, or None."""
+    """Return one sentence that describes the problem with the compiler, or None."""
     if find_compiler():
         return None
     if os.environ.get("CXX"):
@@ -105,7 +104,7 @@ def compiler_problem() -> str | None:
 
 
 def python_problem() -> str | None:
-    """One sentence that says what is wrong with this interpreter, or None."""
+    """Return one sentence that describes the problem with this interpreter, or None."""
     found = ".".join(map(str, sys.version_info[:3]))
     if sys.version_info < OLDEST_PYTHON:
         return f"Python {found} is too old: 3.11 or newer is needed"
