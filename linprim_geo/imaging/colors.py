@@ -1,4 +1,4 @@
-"""Numbers as colours, by one colour map: errors, depths, scales."""
+"""Colour maps for errors and depths."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 
 
 def error_colors(share: np.ndarray) -> np.ndarray:
-    """Colours for values in [0, 1] (clamped), (..., 3) uint8 sRGB: matplotlib's viridis, dark violet through green to
-    light yellow.
+    """Return colours for values in [0, 1] (clamped), (..., 3) uint8 sRGB: matplotlib's viridis, from dark violet
+    through green to light yellow.
 
-    Lightness grows by equal steps, so the order can be seen in grey too, and by the colour-blind.
+    Lightness increases in equal steps, so the order is also visible in grey and to the colour-blind.
     """
-    from matplotlib import colormaps  # a quarter of a second, which commands without pictures are spared
+    from matplotlib import colormaps  # takes a quarter of a second, so imported only here
 
     return colormaps["viridis"](np.asarray(share, np.float64), bytes=True)[..., :3]
 
 
 def depth_preview(depth: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 of a depth map: near is bright yellow, far dark violet, over the middle 98 % of its inverse
-    depths; no depth is black."""
+    """Return (H, W, 3) uint8 of a depth map: near is bright yellow, far dark violet, over the middle 98 % of its
+    inverse depths; pixels without depth are black."""
     valid = np.isfinite(depth) & (depth > 0)
     if not valid.any():
         return np.zeros((*depth.shape, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Photographs that stay decoded, so that a command decodes each of them once."""
+"""A cache of decoded photographs, so that a command decodes each of them once."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-# Bytes of a capture's photographs that stay decoded: a thousand of 480x360, ten of 16 megapixels. Larger captures are
-# streams: the first photographs that are asked for stay, the others are decoded again whenever they are used.
+# Size of the cache in bytes: a thousand photographs of 480x360, ten of 16 megapixels. Of larger captures, the first
+# photographs used are kept, the others are decoded again at every use.
 MOST_BYTES = 2**29
 
 Pixels = tuple[np.ndarray, np.ndarray | None]
 
 
 class DecodedPhotos:
-    """Pixels of photographs by a key of the caller's, up to `limit` bytes in all.
+    """Pixels of photographs by a key of the caller, up to `limit` bytes in total.
 
-    A photograph whose files have changed since is decoded again. Safe to use from several threads. A copy in another
-    process begins empty.
+    A photograph whose files have changed is decoded again. Safe to use from several threads. A copy in another
+    process starts empty.
     """
 
     def __init__(self, limit: int = MOST_BYTES):
@@ -31,7 +31,7 @@ class DecodedPhotos:
         return DecodedPhotos, (self.limit,)
 
     def get(self, key: Hashable, files: Sequence[Path], decode: Callable[[], Pixels]) -> Pixels:
-        """What `decode` gives, or a copy of what it gave when these files were what they are now."""
+        """Return the result of `decode`, or a copy of an earlier result if these files have not changed since."""
         state = tuple(_state(file) for file in files)
         with self._lock:
             kept = self._kept.get(key)
@@ -48,7 +48,7 @@ class DecodedPhotos:
         return pixels
 
     def clear(self) -> None:
-        """Forgets all of them."""
+        """Remove all photographs."""
         with self._lock:
             self._kept.clear()
             self.used = 0
@@ -64,7 +64,7 @@ def _bytes(pixels: Pixels) -> int:
 
 
 def _state(file: Path) -> tuple[int, int] | None:
-    """What tells a file that was written since; None if there is none."""
+    """Return a state of the file that changes when it is written; None if it does not exist."""
     try:
         found = file.stat()
     except OSError:

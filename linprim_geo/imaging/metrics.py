@@ -1,4 +1,4 @@
-"""PSNR and SSIM of two images, and the 8-bit images that they compare."""
+"""PSNR and SSIM of two images, and conversion to the 8-bit images that are compared."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ SSIM_C2 = 0.03**2
 
 
 def to_8bit(image: np.ndarray) -> np.ndarray:
-    """Clamps a float image to [0, 1] and rounds it to uint8, halves upwards."""
+    """Clamp a float image to [0, 1] and round it to uint8, halves upwards."""
     return np.floor(np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared difference over all pixels and
+    """Return the peak signal-to-noise ratio in dB, -10 log10 of the mean squared difference over all pixels and
     channels.
 
-    Identical images give infinity. Nothing is clamped or rounded here.
+    It is infinite for identical images. Nothing is clamped or rounded here.
 
     Args:
         a, b: images of one shape, uint8 or float in [0, 1].
@@ -33,13 +33,12 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity with an 11x11 Gaussian window of sigma 1.5 px, averaged over all pixels and
+    """Return the structural similarity with an 11x11 Gaussian window of sigma 1.5 px, averaged over all pixels and
     channels.
 
     With mu, var and cov the window-weighted mean, variance and covariance around a pixel of one channel, it
     is (2 mu_a mu_b + C1)(2 cov + C2) / ((mu_a^2 + mu_b^2 + C1)(var_a + var_b + C2)), C1 = 0.01^2, C2 =
-    0.03^2. The image is continued by zeros, as 3DGS does, so pixels near the border count with less than a
-    full window.
+    0.03^2. The image is padded with zeros, as in 3DGS, so pixels near the border have less than a full window.
 
     Args:
         a, b: images (H, W) or (H, W, C) of one shape, uint8 or float in [0, 1]; any size, also below 11 px.
@@ -70,7 +69,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def composite(photo, background: np.ndarray) -> np.ndarray:
-    """The photograph over `background` (3,) in [0, 1], as (H, W, 3) uint8; without alpha, as it is."""
+    """Return the photograph over `background` (3,) in [0, 1], as (H, W, 3) uint8; without alpha, unchanged."""
     if photo.alpha is None:
         return photo.rgb
     alpha = photo.alpha[..., None] / 255.0

@@ -1,4 +1,4 @@
-"""Decoding photographs, masks and depth maps, averaging them down, and keeping undistorted ones on disk."""
+"""Decoding of photographs, masks and depth maps, their downscaling, and an on-disk cache of undistorted photographs."""
 
 from __future__ import annotations
 
@@ -17,22 +17,21 @@ from linprim_geo.geometry.sampling import sample_bilinear, sample_nearest
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 _MODES_WITH_ALPHA = ("RGBA", "LA", "PA", "La", "RGBa")
-# Neighbouring depths that differ by less than this ratio are taken for one surface when four are made into
-# one.
+# Largest ratio of neighbouring depths of one surface, when four depths are averaged.
 _SAME_SURFACE_RATIO = 1.05
-# Goes up whenever undistortion gives other pixels, so that old cache entries are not found any more.
+# Incremented whenever undistortion gives other pixels, so that old cache entries are not used.
 _CACHE_VERSION = 1
 
 
 def cache_folder(cache: str | os.PathLike | None = None) -> Path:
-    """The folder for results worth keeping: `cache`, else $LINPRIM_GEO_CACHE, else ~/.cache/linprim-geo."""
+    """Return the folder for cached results: `cache`, else $LINPRIM_GEO_CACHE, else ~/.cache/linprim-geo."""
     if cache:
         return Path(cache)
     return Path(os.environ.get("LINPRIM_GEO_CACHE") or Path.home() / ".cache" / "linprim-geo")
 
 
 def files_in(folder: Path) -> list[Path]:
-    """The images that lie in a folder itself, sorted by name; none if there is no such folder."""
+    """Return the images directly in a folder, sorted by name; none if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(
@@ -42,7 +41,7 @@ def files_in(folder: Path) -> list[Path]:
 
 @contextmanager
 def _opened(path: Path):
-    """A PIL image, with everything that can go wrong while it is open turned into one sentence."""
+    """Open a PIL image; convert all errors while it is open to a LinprimError."""
     from PIL import Image
 
     try:
@@ -71,39 +70,38 @@ def _opened(path: Path):
 
 
 def image_header(path: Path) -> tuple[int, int, bool]:
-    """(width, height, whether there is an alpha channel), from the header alone.
+    """Return (width, height, whether there is an alpha channel), from the header alone.
 
     Raises:
-        LinprimError: missing, empty, or not an image.
+        LinprimError: the file is missing, empty, or not an image.
     """
     with _opened(path) as image:
         return image.width, image.height, _has_alpha(image)
 
 
 def image_format(path: Path) -> str:
-    """Pillow's name of the format that the file has, whatever its suffix says: PNG, JPEG, MPO, WEBP, TIFF, BMP or
+    """Return Pillow's name of the file's actual format, whatever its suffix: PNG, JPEG, MPO, WEBP, TIFF, BMP or
     another.
 
     Raises:
-        LinprimError: missing, empty, or not an image.
+        LinprimError: the file is missing, empty, or not an image.
     """
     with _opened(path) as image:
         return image.format
 
 
 def fits(path: Path, size: tuple[int, int]) -> bool:
-    """Whether the file has `size` (width, height) as stored, or after the rotation that its EXIF data asks
-    for."""
+    """Return whether the image has `size` (width, height) as stored, or after the rotation in its EXIF data."""
     with _opened(path) as image:
         return image.size == size or (image.size == size[::-1] and _is_turned(image))
 
 
 def read_photo(path: Path, size: tuple[int, int] | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decodes to ((H, W, 3) uint8 straight colours, (H, W) uint8 alpha or None); 16-bit files lose their low
+    """Decode to ((H, W, 3) uint8 straight colours, (H, W) uint8 alpha or None); 16-bit files lose their low
     byte.
 
     Raises:
-        LinprimError: unreadable or truncated, or not of `size` (width, height).
+        LinprimError: the file is unreadable or truncated, or not of `size` (width, height).
     """
     from PIL import ImageOps
 
@@ -124,15 +122,16 @@ def read_photo(path: Path, size: tuple[int, int] | None = None) -> tuple[np.ndar
 
 
 def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) uint8 foreground mask: the alpha channel if it says anything, else the brightest channel.
+    """Return the (H, W) uint8 foreground mask: the alpha channel if it is not opaque everywhere, else the brightest
+    channel.
 
-    Files that hold only 0 and 1 count as 0 and 255.
+    In files that hold only 0 and 1, 1 becomes 255.
 
     Raises:
-        LinprimError: unreadable, or not of `size` (width, height).
+        LinprimError: the file is unreadable, or not of `size` (width, height).
     """
     width, height, _ = image_header(path)
-    if (width, height) != size:  # before it is unpacked
+    if (width, height) != size:  # checked before decompression
         raise LinprimError(f"{path}: the mask is {width}x{height}, wanted {size[0]}x{size[1]} as its image")
     rgb, alpha = read_photo(path, None)
     grey = rgb.max(axis=2)
@@ -142,12 +141,13 @@ def read_mask(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) float32 z-depth in the data set's unit: stored values times `scale`; 0 where there is none.
+    """Return (H, W) float32 z-depth in the data set's unit: stored values times `scale`; 0 where there is none.
 
     Reads 16-bit PNG or TIFF, .npy and .npz (the only or the first array).
 
     Raises:
-        LinprimError: unreadable, not one number per pixel, 8-bit, or not of `size` (width, height).
+        LinprimError: the file is unreadable, does not hold one number per pixel, has 8 bits, or is not of `size`
+            (width, height).
     """
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted a depth map")
@@ -170,7 +170,7 @@ def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
             ) from error
     else:
         with _opened(path) as image:
-            check(image.size[::-1], np.dtype(np.float32))  # before it is unpacked
+            check(image.size[::-1], np.dtype(np.float32))  # before decompression
             values = np.asarray(image)
         if values.dtype == np.uint8:
             raise LinprimError(f"{path}: the depth map has {image.mode} pixels of 8 bits, wanted 16-bit grey or float")
@@ -181,10 +181,10 @@ def read_depth(path: Path, scale: float, size: tuple[int, int]) -> np.ndarray:
 
 
 def box_downscale(rgb: np.ndarray, alpha: np.ndarray | None, factor: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Averages blocks of factor x factor pixels, colours weighted by alpha; left-over rows and columns are
+    """Average blocks of factor x factor pixels, colours weighted by alpha; incomplete rows and columns of blocks are
     cropped.
 
-    The mean is of the stored values. Where a block is wholly transparent its colour is the plain mean.
+    The stored values are averaged. The colour of a fully transparent block is the unweighted mean.
     """
     if factor == 1:
         return rgb, alpha
@@ -199,13 +199,14 @@ def box_downscale(rgb: np.ndarray, alpha: np.ndarray | None, factor: int) -> tup
 
 
 def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """(H, W, 3) float32 unit normals as they are stored, in whatever axes; 0 where there is none.
+    """Return (H, W, 3) float32 unit normals as stored, without a change of axes; 0 where there is none.
 
-    Reads 8-bit images, in which a byte b stands for 2 b / 255 - 1 and black for nothing, and .npy of three numbers per
+    Reads 8-bit images, in which a byte b means 2 b / 255 - 1 and black means no normal, and .npy of three numbers per
     pixel.
 
     Raises:
-        LinprimError: unreadable, not three numbers per pixel, or not of `size` (width, height).
+        LinprimError: the file is unreadable, does not hold three numbers per pixel, or is not of `size`
+            (width, height).
     """
     if not path.is_file():
         raise LinprimError(f"{path}: no such file, wanted normals")
@@ -227,7 +228,7 @@ def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
             normals = values.astype(np.float32)
     else:
         with _opened(path) as image:
-            check((image.height, image.width, 3), np.dtype(np.uint8))  # before it is unpacked
+            check((image.height, image.width, 3), np.dtype(np.uint8))  # before decompression
             values = np.asarray(image.convert("RGB"))
         normals = np.where(values.any(-1, keepdims=True), values.astype(np.float32) * (2 / 255) - 1, np.float32(0))
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -236,11 +237,10 @@ def read_normals(path: Path, size: tuple[int, int]) -> np.ndarray:
 
 
 def downscale_depth(depth: np.ndarray, factor: int) -> np.ndarray:
-    """(H // factor, W // factor) float32 depth at the new pixel centres.
+    """Return (H // factor, W // factor) float32 depth at the new pixel centres.
 
-    An odd factor takes the pixel there. With an even one the new centre is the corner of four pixels: their
-    inverse depths are averaged, which is exact on planes, if the four lie on one surface, else there is no
-    depth.
+    An odd factor selects the pixel there. With an even one, the new centre is the common corner of four pixels. If the
+    four are on one surface, their inverse depths are averaged, which is exact on planes; otherwise there is no depth.
     """
     if factor == 1:
         return depth
@@ -257,7 +257,7 @@ def downscale_depth(depth: np.ndarray, factor: int) -> np.ndarray:
 
 
 def undistort_photo(rgb: np.ndarray, alpha: np.ndarray | None, lens: Lens, target: Intrinsics):
-    """Resamples (bilinear, colours weighted by alpha) a photograph of `lens` to the pinhole `target`."""
+    """Resample (bilinear, colours weighted by alpha) a photograph of `lens` to the pinhole camera `target`."""
     pixels = source_pixels(lens, target)
     if alpha is None:
         return _round(sample_bilinear(rgb, pixels)), None
@@ -269,13 +269,13 @@ def undistort_photo(rgb: np.ndarray, alpha: np.ndarray | None, lens: Lens, targe
 
 
 def undistort_depth(depth: np.ndarray, lens: Lens, target: Intrinsics) -> np.ndarray:
-    """Resamples (nearest) a depth map of `lens` to the pinhole `target`; z stays z, the optical axis is
+    """Resample (nearest) a depth map of `lens` to the pinhole camera `target`; z is unchanged, as the optical axis is
     the same."""
     return sample_nearest(depth, source_pixels(lens, target))
 
 
 class UndistortedCache:
-    """Undistorted photographs as PNG files in `folder`, found by the content of what they were made from."""
+    """Undistorted photographs as PNG files in `folder`, identified by a hash of the content of their sources."""
 
     def __init__(self, folder: Path, lens: Lens, target: Intrinsics, sources: tuple[Path | None, ...], flavour: str):
         digest = hashlib.blake2b(repr((_CACHE_VERSION, lens, target, flavour)).encode(), digest_size=16)
@@ -291,7 +291,7 @@ class UndistortedCache:
         self.size = (target.width, target.height)
 
     def get(self) -> tuple[np.ndarray, np.ndarray | None] | None:
-        """The stored photograph, or None if there is no usable one."""
+        """Return the stored photograph, or None if there is no usable one."""
         if not self.path.is_file():
             return None
         try:
@@ -300,8 +300,7 @@ class UndistortedCache:
             return None
 
     def put(self, rgb: np.ndarray, alpha: np.ndarray | None) -> None:
-        """Stores the photograph; a cache that cannot be written is no error, the work is done again next
-        time."""
+        """Store the photograph. An unwritable cache is no error: the photograph is then undistorted again next time."""
         from PIL import Image
 
         pixels = rgb if alpha is None else np.concatenate([rgb, alpha[..., None]], axis=2)
@@ -317,13 +316,13 @@ def _has_alpha(image) -> bool:
 
 
 def _is_turned(image) -> bool:
-    """Whether EXIF says that rows and columns are to be exchanged (orientations 5 to 8)."""
+    """Return whether EXIF demands that rows and columns are exchanged (orientations 5 to 8)."""
     orientation_tag = 0x0112
     return image.getexif().get(orientation_tag, 1) in (5, 6, 7, 8)
 
 
 def _to_byte(values: np.ndarray) -> np.ndarray:
-    """Grey of more than 8 bits to uint8: the high byte of 16, floats as [0, 1]."""
+    """Convert grey of more than 8 bits to uint8: the high byte of 16 bits, floats as [0, 1]."""
     if values.dtype.kind == "f":
         return _round(np.clip(np.nan_to_num(values), 0.0, 1.0) * 255.0)
     return (np.clip(values, 0, 65535).astype(np.uint16) >> 8).astype(np.uint8)

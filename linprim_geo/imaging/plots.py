@@ -1,7 +1,7 @@
 """Plots by matplotlib: curves and frontiers as SVG for pages and files, rates and histograms as PNG.
 
-SVG takes its colours from CSS variables of the names in `COLORS`, so a page can be light or dark; where it defines
-none, the colours here are used. The same numbers give the same bytes.
+SVG takes its colours from CSS variables with the names in `COLORS`, so a page can be light or dark; without them, the
+colours here are used. Equal numbers give equal bytes.
 """
 
 from __future__ import annotations
@@ -33,20 +33,21 @@ COLORS = {
     "orange": "#c25e0c",
     "dim": "#707a86",
 }
-# Pixels of one plot, and of what is round its frame: left, right, top, bottom.
+# Size of one plot in pixels, and the margins around its frame: left, right, top, bottom.
 WIDTH, HEIGHT = 560, 340
 MARGINS = (74, 24, 40, 52)
 PNG_WIDTH, PNG_HEIGHT = 900, 590
 PNG_MARGINS = (78, 26, 98, 62)
 TICKS = 7
-# A logarithmic axis over less than this ratio has too few of 1, 2 and 5 and takes evenly spaced ticks.
+# A logarithmic axis over a smaller ratio than this would have too few ticks at 1, 2 and 5, so its ticks are evenly
+# spaced.
 SHORT = 10
 HISTOGRAM_BINS = 80
 
 
 @dataclass(frozen=True)
 class Point:
-    """A measured setting: cost `x` with its quartiles, error `y`; whether it is on the frontier, and the default."""
+    """A measured setting: cost `x` with its quartiles, error `y`, whether it is on the frontier, and the default."""
 
     name: str
     x: float
@@ -59,7 +60,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Panel:
-    """Points in one frame, both axes logarithmic."""
+    """Points in one frame with logarithmic axes."""
 
     title: str
     points: Sequence[Point]
@@ -70,9 +71,10 @@ class Panel:
 def curves(
     series: Sequence[tuple[str, Sequence[float], Sequence[float]]], x_label: str, y_label: str, *, log: bool = False
 ) -> str:
-    """An SVG element of up to two curves (name, x, y); x linear, y linear, or logarithmic for positive values.
+    """Return an SVG element of up to two curves (name, x, y); x is linear, y linear, or logarithmic for positive
+    values.
 
-    Each is named above the frame with its last value. A curve of one point is drawn as a point.
+    Each is named above the frame with its last value. A curve of one point is drawn as a marker.
     """
     with _style():
         figure, (axes,) = _figure(1, WIDTH, HEIGHT, MARGINS)
@@ -89,11 +91,11 @@ def curves(
 
 
 def frontiers(panels: Sequence[Panel], label: str, style: str | None = None) -> str:
-    """An SVG element of panels beside each other; `label` says what it is to people who cannot see it.
+    """Return an SVG element of panels next to each other; `label` is its text alternative.
 
-    Every point is named, with the quartiles of its cost as a bar and a ring round the default; the frontier is a line
-    in steps. An error of 0 is drawn a decade below the least that is not. With a `style` sheet the text of a file, on a
-    ground of its own.
+    Every point has its name, a bar for the quartiles of its cost, and a ring if it is the default; the frontier is a
+    step line. An error of 0 is drawn a decade below the smallest other one. With a `style` sheet, return the text of an
+    SVG file with a background of its own.
     """
     with _style():
         figure, frames = _figure(len(panels), WIDTH, HEIGHT, MARGINS)
@@ -113,7 +115,7 @@ def rates(
     title: str,
     unit: str,
 ) -> None:
-    """Writes a PNG of shares (name: one per threshold) over thresholds on a logarithmic axis, with their values at
+    """Write a PNG of shares (name: one per threshold) over thresholds on a logarithmic axis, with their values at
     `tau`.
 
     Raises:
@@ -122,7 +124,7 @@ def rates(
     with _style():
         figure, (axes,) = _figure(1, PNG_WIDTH, PNG_HEIGHT, PNG_MARGINS)
         axes.set_xscale("log")
-        # Thinner and thinner, so that curves that coincide can all be seen.
+        # Line widths decrease, so that coinciding curves are all visible.
         for (name, share), color, width in zip(
             shares.items(), ("blue", "orange", "ink"), (6.0, 3.5, 1.5), strict=False
         ):
@@ -134,7 +136,7 @@ def rates(
 
 
 def histogram(path: Path, distances: Mapping[str, np.ndarray], end: float, tau: float, title: str, unit: str) -> None:
-    """Writes a PNG with histograms of distances (name: values) from 0 to `end`.
+    """Write a PNG with histograms of distances (name: values) from 0 to `end`.
 
     Raises:
         LinprimError: the file cannot be written.
@@ -159,12 +161,12 @@ def histogram(path: Path, distances: Mapping[str, np.ndarray], end: float, tau: 
 
 @contextlib.contextmanager
 def _style() -> Iterator[None]:
-    """Settings of matplotlib for every plot here; lengths are pixels."""
+    """Apply matplotlib's settings for all plots here; lengths are in pixels."""
     import matplotlib
 
-    # It warns that it makes a cache of fonts, or that the home folder cannot be written.
+    # Suppress warnings that a font cache is made, or that the home folder cannot be written.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    # matplotlib reads a file of settings from the folder that this is called in: its defaults first.
+    # matplotlib reads settings from a file in the current folder, so its defaults are restored first.
     with matplotlib.rc_context(
         matplotlib.rcParamsDefault
         | {
@@ -197,7 +199,7 @@ def _style() -> Iterator[None]:
 
 
 def _figure(panels: int, width: int, height: int, margins: tuple[int, int, int, int]) -> tuple[Figure, list[Axes]]:
-    """A figure of panels beside each other, each so many pixels large."""
+    """Return a figure of panels next to each other, each of `width` x `height` pixels."""
     from matplotlib.figure import Figure
 
     whole = panels * width
@@ -210,7 +212,7 @@ def _figure(panels: int, width: int, height: int, margins: tuple[int, int, int, 
 
 
 def _label(axes: Axes, x_label: str, y_label: str) -> None:
-    """Names the axes, and puts a few round numbers beside them."""
+    """Label the axes, and set a few ticks at round numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     axes.set(xlabel=x_label, ylabel=y_label)
@@ -226,7 +228,7 @@ def _label(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def _legend(axes: Axes) -> None:
-    """One row above the frame, where it hides nothing."""
+    """Add a legend in one row above the frame, where it hides nothing."""
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2, handlelength=1.6)
 
 
@@ -267,7 +269,7 @@ def _draw_panel(figure: Figure, axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.title)
     on = sorted((point.x, y) for point, y in zip(points, heights, strict=True) if point.on_frontier)
     if on:
-        # What one can have: the error of the best that takes no longer, so the line goes in steps.
+        # The best error achievable within a given time is a step function.
         x = [on[0][0], *(x for x, _ in on), axes.get_xlim()[1]]
         y = [axes.get_ylim()[1], *(y for _, y in on), on[-1][1]]
         axes.step(x, y, where="post", color=COLORS["blue"], linewidth=1.5, alpha=0.6)
@@ -281,7 +283,7 @@ def _draw_panel(figure: Figure, axes: Axes, panel: Panel) -> None:
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """Limits of a logarithmic axis round positive values, with room for names."""
+    """Return limits of a logarithmic axis around positive values, with room for names."""
     low, high = np.log10(min(values)), np.log10(max(values))
     room = max(0.15 * (high - low), 0.06)
     return float(10 ** (low - room)), float(10 ** (high + room))
@@ -293,8 +295,8 @@ Box = tuple[float, float, float, float]
 def _name_points(
     figure: Figure, axes: Axes, points: Sequence[Point], heights: Sequence[float], on: Sequence[tuple[float, float]]
 ) -> None:
-    """Writes every point's name near it, where it covers the least of what is drawn; matplotlib itself would write
-    names over each other."""
+    """Write every point's name near it, where it covers least of what is drawn; matplotlib itself would let names
+    overlap."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -322,7 +324,7 @@ def _name_points(
 def _free_place(
     x: float, y: float, width: float, height: float, frame: Box, boxes: Sequence[Box]
 ) -> tuple[float, float]:
-    """Left and bottom of a name near a point, where it covers the least of `boxes`, and stays inside the frame."""
+    """Return left and bottom of a name near a point, where it covers least of `boxes` and is inside the frame."""
     places = [(x + 10, y - height / 2), (x - 10 - width, y - height / 2)]
     for away in (1.0, 1.8, 2.6):
         for left in (x + 6, x - 6 - width):
@@ -350,14 +352,14 @@ def _free_place(
 
 
 def _element(figure: Figure, label: str, style: str | None = None) -> str:
-    """The figure as an SVG element for a page: no namespaces, no style sheet that would reach the page, no ids that
-    nothing refers to. With a `style` the text of a file."""
+    """Return the figure as an SVG element for a page: without namespaces, style sheets that would affect the page, and
+    unused ids. With a `style`, return the text of an SVG file."""
     from matplotlib import rc_context
 
     for artist in figure.findobj():
-        artist.set_clip_on(False)  # nothing lies outside, and what clips is found by an address
+        artist.set_clip_on(False)  # nothing is outside, and clip paths would be referenced by ids
     written = io.BytesIO()
-    with rc_context({"svg.hashsalt": label}):  # ids are the same every time, and others in another plot of a page
+    with rc_context({"svg.hashsalt": label}):  # ids are reproducible, and differ between the plots of a page
         figure.savefig(written, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
     root = ElementTree.fromstring(written.getvalue())
     for element in root.iter():
