@@ -1,1 +1,1 @@
-"""Tasks on several processes of this machine or on Ray."""
+"""Tasks that run in several processes of this machine or on Ray."""

@@ -1,7 +1,8 @@
 """Runs tasks on several workers: processes of this machine, or a Ray cluster.
 
-A task is idempotent, writes into a folder that all workers see, and leaves a marker there when it is done (worker.py).
-So one that dies is begun again, one that is done is not, and what is stopped altogether goes on where its folders say.
+A task is idempotent, writes to a folder that all workers share, and leaves a marker there when it is done (worker.py).
+So a task whose worker dies is started again, a finished one is not repeated, and a stopped run continues from its
+folders.
 """
 
 from __future__ import annotations
@@ -14,17 +15,17 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.progress import Progress
 from linprim_geo.jobs.worker import result_of, versions, write_token
 
-# A task that has died so often does not come through.
+# Number of attempts after which a dying task is given up.
 ATTEMPTS = 5
-# Seconds between looks at how far tasks are, and that workers get to end by themselves.
+# Interval of checks of the tasks' progress, and time for workers to end by themselves, seconds.
 LOOK, PATIENCE = 0.5, 10.0
 
 
 @dataclass(frozen=True)
 class Task:
-    """`function` is "module:function" of this package, called as function(folder, **arguments) with arguments that JSON
-    can hold; it gives back a table of plain values. `memory_gib` and `cores` are what it will take, `remedy` what to
-    change where that is too much."""
+    """A call of `function`, "module:function" of this package, as function(folder, **arguments), with arguments in
+    types of JSON; it returns a dict of plain values. `memory_gib` and `cores` are its estimated needs, `remedy` is the
+    advice if they are too large."""
 
     name: str
     function: str
@@ -37,7 +38,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an attempt at a task ended; one of the four."""
+    """The outcome of an attempt at a task; exactly one field is set."""
 
     result: dict | None = None
     error: str | None = None
@@ -46,15 +47,15 @@ class Outcome:
 
 
 class Executor:
-    """Does tasks, as many at a time as there are cores and memory for. A context manager: leaving it ends every worker.
+    """Runs tasks, as many at a time as cores and memory allow. As a context manager, it ends every worker on exit.
 
-    An engine has `capacity`, `start`, `ended` and `stop`.
+    Subclasses implement `capacity`, `start`, `ended` and `stop`.
     """
 
     what = ""
 
     def __init__(self, shared: Path):
-        """`shared`: the folder that all of the tasks' folders lie in; made if need be."""
+        """`shared`: the parent folder of all tasks' folders; created if necessary."""
         self.shared = Path(shared).resolve()
         self.shared.mkdir(parents=True, exist_ok=True)
         self.about = {"versions": versions(), "token": write_token(self.shared), "shared": str(self.shared)}
@@ -66,14 +67,14 @@ class Executor:
         self.stop()
 
     def run(self, tasks: Sequence[Task], progress: Progress, state: Callable[[Task], str] | None = None) -> list[dict]:
-        """Does all tasks that are not done yet and returns the results of all, in their order.
+        """Run all unfinished tasks and return the results of all, in their order.
 
         Args:
-            state: says how far a running task is, for the line of progress.
+            state: returns the progress of a running task, for the progress line.
 
         Raises:
-            LinprimError: a task failed, took more memory than there is, or died ATTEMPTS times. The others are stopped;
-                what they have written is kept, and the next run goes on from it.
+            LinprimError: a task failed, needed more memory than there is, or died ATTEMPTS times. The others are
+                stopped; what they have written is kept, and the next run continues from it.
         """
         specs = [self._spec(task) for task in tasks]
         results = {k: result for k, spec in enumerate(specs) if (result := result_of(spec)) is not None}
@@ -133,24 +134,24 @@ class Executor:
         )
 
     def capacity(self) -> tuple[float, float]:
-        """(cores, GiB) that may be taken by all running tasks together."""
+        """Return (cores, GiB) available to all running tasks together."""
         raise NotImplementedError
 
     def start(self, spec: dict, task: Task) -> object:
-        """Begins a task and returns its handle."""
+        """Start a task and return its handle."""
         raise NotImplementedError
 
     def ended(self, handles: Sequence[object], seconds: float) -> list[tuple[object, Outcome]]:
-        """Those that have ended, waiting up to `seconds` for the first of them."""
+        """Return the ended ones, waiting up to `seconds` for the first of them."""
         raise NotImplementedError
 
     def stop(self) -> None:
-        """Ends every worker."""
+        """End every worker."""
         raise NotImplementedError
 
 
 def outcome_of(answer: dict) -> Outcome:
-    """What `worker.run_task` answered."""
+    """Return the outcome for an answer of `worker.run_task`."""
     if "result" in answer:
         return Outcome(result=answer["result"])
     if "stopped" in answer:

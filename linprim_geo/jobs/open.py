@@ -1,4 +1,4 @@
-"""Chooses who works on tasks: processes of this machine, or Ray."""
+"""Selects the executor of tasks: processes of this machine, or Ray."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from linprim_geo.jobs.processes import Processes
 
 
 def open_executor(cluster: str | None, shared: Path, workers: int = 0) -> Executor:
-    """Processes of this machine without `cluster`, else Ray: "local" starts it here, an address joins the one that runs
-    there.
+    """Return an executor: processes of this machine without `cluster`, else Ray. "local" starts Ray here, an address
+    joins the cluster there.
 
     Args:
-        shared: a folder that all workers see.
-        workers: at once at most; 0: as many as there are cores.
+        shared: a folder that all workers share.
+        workers: the largest number at once; 0: as many as there are cores.
 
     Raises:
         LinprimError: Ray is not installed, or no cluster answers at the address.

@@ -1,4 +1,4 @@
-"""Tasks by processes of this machine: one per task, killed ones are reported and tried again."""
+"""Runs each task in a process of this machine; killed processes are reported and tried again."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from linprim_geo.jobs.worker import ONE_THREAD
 
 
 class Processes(Executor):
-    """A process of this machine for every task, started anew, never forked. Several of them have one thread each."""
+    """Starts a new process of this machine for every task, without forking. Each has one thread."""
 
     what = "processes of this machine"
 
     def __init__(self, shared: Path, workers: int = 0):
-        """`workers` at once at most; 0: one per core."""
+        """`workers`: the largest number at once; 0: one per core."""
         super().__init__(shared)
         self.workers = workers or usable_cores()
         self.memory_gib = available_memory() / 2**30
@@ -35,8 +35,8 @@ class Processes(Executor):
 
     def start(self, spec, task):
         kills = _oom_kills()
-        # In a session of its own: Ctrl-C is for the driver, which then ends its workers.
-        # -P: no module comes from the folder this was called in, which may be a downloaded capture.
+        # In a separate session, so that Ctrl-C reaches only the driver, which then ends its workers.
+        # -P: no module is imported from the current folder, which may be a downloaded capture.
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "linprim_geo.jobs.worker"],
             stdin=subprocess.PIPE,
@@ -44,7 +44,7 @@ class Processes(Executor):
             env=os.environ | ONE_THREAD,
             start_new_session=True,
         )
-        with suppress(BrokenPipeError):  # died already, which its exit status tells
+        with suppress(BrokenPipeError):  # it has already died, which its exit status shows
             process.stdin.write(json.dumps(spec).encode() + b"\n")
             process.stdin.flush()
         self.processes[process] = kills
@@ -52,7 +52,7 @@ class Processes(Executor):
 
     def ended(self, handles, seconds):
         with selectors.DefaultSelector() as selector:
-            for process in handles:  # its stdout ends with it
+            for process in handles:  # its stdout closes when it ends
                 selector.register(process.stdout, selectors.EVENT_READ, process)
             ready = [key.data for key, _ in selector.select(seconds)]
         return [(process, self._outcome(process)) for process in ready]
@@ -78,7 +78,7 @@ class Processes(Executor):
 
     def stop(self):
         for process in self.processes:
-            process.send_signal(signal.SIGINT)  # a training saves what it has
+            process.send_signal(signal.SIGINT)  # a training then saves its state
         end = time.monotonic() + PATIENCE
         for process in list(self.processes):
             try:
@@ -90,7 +90,7 @@ class Processes(Executor):
 
 
 def _oom_kills() -> int:
-    """How many processes this system has killed for want of memory since its start; 0 where it does not tell."""
+    """Return the number of processes that this system has killed for lack of memory since its start; 0 if unknown."""
     try:
         with open("/proc/vmstat") as file:
             return next((int(line.split()[1]) for line in file if line.startswith("oom_kill ")), 0)

@@ -1,5 +1,5 @@
-"""Tasks on a Ray cluster. Ray chooses the machine by cores and memory; retries are the executor's, which counts
-them."""
+"""Runs tasks on a Ray cluster. Ray chooses the machine by cores and memory; the executor retries and counts
+attempts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.jobs.executor import Executor, Outcome, outcome_of
 from linprim_geo.jobs.worker import ONE_THREAD
 
-# Seconds in which a running cluster has to answer, and how often a start of one is tried that does not come up in time.
+# Time limit for the answer of a running cluster, seconds, and number of attempts at a start that times out.
 ANSWER_SECONDS, STARTS = 10, 3
 
 
@@ -24,7 +24,7 @@ class RayCluster(Executor):
     what = "Ray"
 
     def __init__(self, shared: Path, address: str, workers: int = 0):
-        # Nothing is reported to Ray's makers, and nothing warned of that concerns GPUs.
+        # No usage statistics are sent to Ray's makers, and no warnings about GPUs are printed.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         try:
@@ -42,25 +42,25 @@ class RayCluster(Executor):
             raise LinprimError("--cluster: this process has joined a Ray cluster already, wanted one that has not")
         if address == "local":
             how |= {"num_cpus": workers or usable_cores(), "include_dashboard": False}
-            # No other machine is to reach it, and it wants no name service.
+            # Other machines cannot connect, and no name service is needed.
             how["_node_ip_address"] = "127.0.0.1"
         ending = signal.getsignal(signal.SIGTERM)
         here = Path.cwd()
         try:
-            # Ray's workers import from the folder that this process joins in, which may be a downloaded capture.
+            # Ray's workers import from the folder in which this process joins, which may be a downloaded capture.
             os.chdir(here.anchor)
             self._join(address, how)
-        except Exception as error:  # noqa: BLE001 - Ray raises a plain Exception where its start takes too long
+        except Exception as error:  # noqa: BLE001 - Ray raises a plain Exception if its start takes too long
             raise _no_answer(address, error) from None
         finally:
             os.chdir(here)
-            with suppress(ValueError):  # Ray sets one of its own
+            with suppress(ValueError):  # Ray sets its own handler
                 signal.signal(signal.SIGTERM, ending)
         self.workers = workers or 10**9
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self.cores = max((int(node.get("CPU", 0)) for node in nodes), default=1) or 1
         self.memory_gib = max((node.get("memory", 0.0) for node in nodes), default=0.0) / 2**30
-        # A process for every task: what one has taken is free when the next begins.
+        # A new process for every task, so that its memory is free when the next one starts.
         self.remote = ray.remote(max_retries=0, max_calls=1)(_work)
 
     def _join(self, address: str, how: dict) -> None:
@@ -68,13 +68,13 @@ class RayCluster(Executor):
             try:
                 self.ray.init(address=address, **how)
                 return
-            except Exception as error:  # noqa: BLE001 - a plain one on a machine too busy to start it in time
+            except Exception as error:  # noqa: BLE001 - a plain one if the machine is too busy to start it in time
                 self.ray.shutdown()
                 if address != "local" or attempt + 1 == STARTS or "timed out" not in str(error):
                     raise
 
     def capacity(self):
-        # How many fit at once, and where, is Ray's to say; a single task has to fit a machine.
+        # Ray decides how many tasks run at once, and where; a single task has to fit in one machine.
         return self.workers, self.memory_gib
 
     def _has_room(self, task, beside):
@@ -117,7 +117,7 @@ class RayCluster(Executor):
 
 
 def _check_answer(address: str) -> None:
-    """Raises LinprimError unless something listens at host:port, which Ray itself waits minutes for."""
+    """Raise LinprimError if nothing listens at host:port, for which Ray itself would wait minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not (host and port.isdigit()):
         raise LinprimError(f"--cluster is {address!r}, wanted local, auto, or an address such as 10.0.0.1:6379")
@@ -134,7 +134,7 @@ def _no_answer(address: str, error: Exception) -> LinprimError:
 
 
 def _work(task: dict) -> dict:
-    """`worker.run_task` where Ray has started a process for it."""
+    """Call `worker.run_task` in a process started by Ray."""
     import torch
 
     from linprim_geo.jobs.worker import run_task

@@ -1,10 +1,9 @@
-"""What a worker does with one task: makes sure that it is the program and the folder that were meant, computes, leaves
-a done-marker.
+"""A worker's part of one task: checks that program and folder are those of the driver, computes, leaves a marker.
 
-As a program (`python -m linprim_geo.jobs.worker`) it takes one task as a line of JSON on stdin and answers with a line
-of JSON on stdout. It ends when its stdin does, so that no worker outlives whoever started it. A task is the name of a
-function, `module:function` of this package, which is called with the task's folder and its arguments and gives back a
-table of plain values.
+As a program (`python -m linprim_geo.jobs.worker`) it reads one task as a line of JSON from stdin and writes its answer
+as a line of JSON to stdout. It ends when stdin closes, so that no worker outlives the process that started it. A task
+is the name of a function, `module:function` of this package, which is called with the task's folder and its arguments
+and returns a dict of plain values.
 """
 
 from __future__ import annotations
@@ -26,18 +25,18 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import locked, read_json, remove_temporary, write_json
 from linprim_geo.base.version import __version__
 
-# The marker of a task that is done, in its folder, and the token by which workers know the driver's folder.
+# The marker of a finished task in its folder, and the token by which workers recognize the driver's folder.
 DONE, TOKEN = "done.json", "folder_token"
-# One thread per worker: pools of several would wait for each other.
+# One thread per worker: thread pools of several workers would wait for each other.
 ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")}
-# Threads that the task of this worker may use.
+# Number of threads that the task of this worker may use.
 cores = 1
-# How torch and C++ say that there is no memory left.
+# Messages of torch and C++ for a lack of memory.
 _NO_MEMORY = re.compile(r"not enough memory|can't allocate memory|bad_alloc|[Cc]annot allocate memory")
 
 
 def versions() -> dict[str, str]:
-    """What has to be the same on all workers for results to be: the versions, and a digest of this package's
+    """Return what must be equal on all workers for equal results: the versions, and a digest of this package's
     sources."""
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.parent.rglob("*.py")):
@@ -47,7 +46,7 @@ def versions() -> dict[str, str]:
 
 
 def write_token(folder: Path) -> str:
-    """Marks a folder so that workers can tell whether they see it. Returns the token, which a folder keeps."""
+    """Mark a folder so that workers can recognize it. Return its token, which never changes."""
     file = folder / TOKEN
     if not file.exists():
         write_json(file, uuid.uuid4().hex)
@@ -55,13 +54,13 @@ def write_token(folder: Path) -> str:
 
 
 def key_of(task: dict) -> str:
-    """What tells a task from others: its function and arguments."""
+    """Return a hash that identifies a task by its function and arguments."""
     plain = json.dumps([task["function"], task["arguments"]], sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 def result_of(task: dict) -> dict | None:
-    """The result of a task that is done, None of one that is not.
+    """Return the result of a finished task, None of an unfinished one.
 
     Raises:
         LinprimError: the folder holds the result of another task.
@@ -78,10 +77,10 @@ def result_of(task: dict) -> dict | None:
 
 
 def result_of_folder(folder: Path) -> dict:
-    """The result of the task that was done in a folder.
+    """Return the result of the task that was finished in a folder.
 
     Raises:
-        LinprimError: none was.
+        LinprimError: there is none.
     """
     done = read_json(folder / DONE, "the marker of a task that is done")
     if not isinstance(done, dict) or not isinstance(done.get("result"), dict):
@@ -90,15 +89,15 @@ def result_of_folder(folder: Path) -> dict:
 
 
 def run_task(task: dict) -> dict:
-    """Does a task unless it is done already. Returns {"result"}, or {"error"} or {"memory"} with a sentence about what
-    stopped it."""
+    """Run a task unless it is finished. Return {"result"}, {"error"} or {"memory"} with a sentence about the failure,
+    or {"stopped"}."""
     try:
         return {"result": _run_task(task)}
     except LinprimError as error:
         return {"error": str(error)}
     except KeyboardInterrupt:
         return {"stopped": "interrupted"}
-    except Exception as error:  # noqa: BLE001 - it is told where the sentence is printed
+    except Exception as error:  # noqa: BLE001 - it is reported where the sentence is printed
         text = " ".join(f"{type(error).__name__}: {error}".split())[:500]
         if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY.search(text)):
             return {"memory": text}
@@ -110,7 +109,7 @@ def _run_task(task: dict) -> dict:
     _check_worker(task)
     cores = task["cores"]
     folder = Path(task["folder"])
-    # A worker of a driver that was killed may still be ending.
+    # A worker of a killed driver may still be ending.
     with locked(folder, "computed", "task", wait=lambda: None):
         done = result_of(task)
         if done is not None:
@@ -121,14 +120,14 @@ def _run_task(task: dict) -> dict:
         result = getattr(import_module(module), function)(folder, **task["arguments"])
         from linprim_geo.base.memory import peak_gib
 
-        # What the system counts as the peak of children begins with that of the process that they are copies of.
+        # The system's peak of a child process starts with that of the process it was copied from.
         result |= {"task_seconds": time.monotonic() - begin, "task_peak_gib": peak_gib()}
         write_json(folder / DONE, {"task": key_of(task), "name": task["name"], "result": result})
         return result_of_folder(folder)
 
 
 def _check_worker(task: dict) -> None:
-    """Raises LinprimError unless this is the driver's program and folder."""
+    """Raise LinprimError unless the program and the shared folder are those of the driver."""
     here, where = versions(), f"the worker on {platform.node()}"
     for name, wanted in task["versions"].items():
         if here.get(name) != wanted:
@@ -149,15 +148,15 @@ def _check_worker(task: dict) -> None:
 
 
 def _end_with(stream) -> None:
-    """Ends this process as soon as whoever holds the other end of the stream has ended."""
+    """End this process as soon as the process at the other end of the stream has ended."""
     stream.read()
     os.kill(os.getpid(), getattr(signal, "SIGKILL", signal.SIGTERM))
 
 
 def main() -> None:
     answers = os.dup(1)
-    os.dup2(2, 1)  # what libraries print is no answer
-    # Ctrl-C may be ignored by what started the driver, but not here: it is how the driver ends a worker.
+    os.dup2(2, 1)  # output of libraries is not part of the answer
+    # The program that started the driver may ignore Ctrl-C, but not this one: the driver ends workers by it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         task = json.loads(sys.stdin.readline())
