@@ -1,5 +1,4 @@
-"""Meshes to be looked at: made light enough for a page, with a set of colours to switch between, and which way is
-up."""
+"""Meshes for display: decimation for an HTML page, colour layers to choose from, and the upward direction."""
 
 from __future__ import annotations
 
@@ -11,20 +10,20 @@ import numpy as np
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.mesh import Mesh
 
-# Errors are shown up to this quantile of theirs; what is beyond has the last colour.
+# Quantile of the errors, in per cent, at which the colour scale ends; larger errors have the last colour.
 TOP_QUANTILE = 95.0
 GREY = 205
-# Cells of clustering are made larger by at least this factor until few enough faces are left.
+# Least factor by which the cells of clustering grow, until few enough faces are left.
 _LEAST_GROWTH = 1.05
-# Below this share of the second smallest, the smallest spread of the cameras' x axes is taken for that along the
-# vertical.
+# The direction of the smallest spread of the cameras' x axes is taken as vertical if that spread is below this share of
+# the second smallest.
 _CLEARLY_UPRIGHT = 0.2
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One way to colour the vertices: (V, 3) uint8 `colors`, and for a figure its `top` in the mesh's unit and its
-    `median`."""
+    """One way to colour the vertices: (V, 3) uint8 `colors`; for errors also the end of the scale, `top`, and the
+    `median`, in the mesh's unit."""
 
     name: str
     colors: np.ndarray
@@ -33,14 +32,15 @@ class Layer:
 
 
 def light_mesh(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
-    """At most `most` faces, by clustering vertices into cells of a grid and placing each cell's vertex by quadric
+    """Reduce a mesh to at most `most` faces by clustering vertices in a grid; each cell's vertex is placed by quadric
     error.
 
-    Quick in place of careful: for display alone. Holes and sheets nearer than a cell may close or stick together.
+    It is fast rather than accurate, for display only. Holes and sheets narrower or nearer than a cell may be closed or
+    merged.
 
     Returns:
-        The mesh without attributes, the row of the nearest vertex of the old mesh for each of its vertices, and the
-        edge of the cells in the mesh's unit, 0 if nothing had to be done.
+        The mesh without attributes, for each of its vertices the row of the nearest vertex of the old mesh, and the
+        edge of the cells in the mesh's unit, 0 if nothing was reduced.
     """
     if len(mesh.faces) <= most:
         return Mesh(mesh.vertices, mesh.faces), np.arange(len(mesh.vertices)), 0.0
@@ -54,7 +54,7 @@ def light_mesh(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
         open3d.utility.Vector3dVector(mesh.vertices - middle),
         open3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
     )
-    # Even triangles of a surface of area A on a grid of cells c: about 2 A / c^2.
+    # A surface of area A in a grid of cells c has about 2 A / c^2 even triangles.
     cell = float(np.sqrt(2.0 * face_areas(mesh).sum() / most))
     while True:
         found = body.simplify_vertex_clustering(cell, open3d.geometry.SimplificationContraction.Quadric)
@@ -67,10 +67,10 @@ def light_mesh(mesh: Mesh, most: int) -> tuple[Mesh, np.ndarray, float]:
 
 
 def layers(mesh: Mesh, rows: np.ndarray, error: np.ndarray | None = None) -> list[Layer]:
-    """What vertices `rows` of a mesh can be coloured by: photographs, shape alone, predicted error (`quality`), true
-    `error` (R,).
+    """Return the colour layers for vertices `rows` of a mesh: photographs, plain shape, predicted error (`quality`),
+    true `error` (R,).
 
-    Both errors have one scale, that of the true one if there is one, so that equal colours are equal lengths.
+    Both errors use one scale, that of the true error if it is given, so that equal colours are equal lengths.
     """
     from linprim_geo.imaging.colors import error_colors
 
@@ -92,10 +92,10 @@ def layers(mesh: Mesh, rows: np.ndarray, error: np.ndarray | None = None) -> lis
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) unit vector that points up in the photographs.
+    """Return (3,) the unit vector that points upwards in the photographs.
 
-    Photographers keep the horizon level: the direction that the cameras' x axes are at right angles to, as long as
-    there is one, else the mean of the images' upward directions.
+    Photographers keep the horizon level. So it is the direction perpendicular to the cameras' x axes, if it is well
+    determined, else the mean of the images' upward directions.
     """
     upward = -np.mean([camera.rotation[1] for camera in cameras], axis=0)
     sideways = np.stack([camera.rotation[0] for camera in cameras])
@@ -107,6 +107,6 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def is_inside(mesh: Mesh, cameras: Sequence[Camera]) -> bool:
-    """Whether most cameras stand within the box of a mesh, as in a room."""
+    """Return whether most cameras are inside the bounding box of a mesh, as in a room."""
     low, high = mesh.bounds
     return float(np.mean([((camera.center > low) & (camera.center < high)).all() for camera in cameras])) > 0.5

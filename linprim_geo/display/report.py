@@ -1,5 +1,5 @@
-"""What goes into the report of a run: everything its folder and its capture say, with missing parts named; the page is
-report_page's."""
+"""The report of a run: gathers everything in its folder and its capture, and lists what is missing. The page is made by
+report_page."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ def report_run(
     output: str | os.PathLike | None = None,
     reference: str | os.PathLike | None = None,
 ) -> dict:
-    """Writes one HTML file about a run, RUN/report.html unless `output` says otherwise; nothing else in the run is
-    changed.
+    """Write one HTML file about a run, by default RUN/report.html; nothing else in the run is changed.
 
-    The page needs nothing but itself. Scores that RUN/eval holds are taken if they are newer than the run's last save;
-    what is missing of colours, and of depth where the data set has depth or a `reference` mesh is given, is scored now.
+    The page is self-contained. Scores in RUN/eval are used if they are newer than the run's last save. Missing scores
+    of images, and of depth if the data set has depth or a `reference` mesh is given, are computed now.
 
     Returns: `report`, `bytes`, `views` (shown), `meshes` (methods), `missing` (sentences), `seconds`.
 
     Raises:
-        LinprimError: not a run folder, `reference` cannot be read, or the page cannot be written.
+        LinprimError: the folder holds no run, `reference` cannot be read, or the page cannot be written.
     """
     from linprim_geo.display.report_page import page
 
@@ -51,5 +50,5 @@ def report_run(
 
 
 def describe(made: dict) -> str:
-    """What `report_run` returns as lines for a person: the page, and what is missing on it."""
+    """Return the result of `report_run` as readable lines: the page, and what is missing on it."""
     return "\n".join([f"{made['report']}: {made['bytes'] / 2**20:.1f} MiB", *made["missing"]])

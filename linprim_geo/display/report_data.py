@@ -1,4 +1,4 @@
-"""What a report shows: views with their errors, meshes, evidence, commands."""
+"""Gathers the content of a report: views with their errors, meshes, evidence, commands."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from linprim_geo.capture.types import Scene, View
 from linprim_geo.display.report_mesh import HEADLINE, ShownMesh, find_meshes, read_json
 from linprim_geo.runs.run import Run
 
-# Held-out views that are shown, and the longer side of their pictures: they make the page's size.
+# Number of held-out views on the page, and the longer side of their images, pixels; they dominate the page's size.
 VIEWS, PIXELS = 4, 320
-# Differences of colours, of white, and of depths, of the truth, that have the last colour.
+# Ends of the error scales: of colours, as a share of white, and of depths, as a share of the true depth.
 COLOR_TOP, DEPTH_TOP = 0.2, 0.05
 
 
 @dataclass
 class ShownView:
-    """A held-out view: its scores and (title, PNG as a data URI, width, height) per picture."""
+    """A held-out view: its scores, and (title, PNG as a data URI, width, height) for each image."""
 
     name: str
     psnr: float
@@ -38,7 +38,7 @@ class ShownView:
 
 @dataclass
 class Report:
-    """All that the page shows. What could not be had is None or empty, and a sentence in `missing` says why."""
+    """The content of the page. Unavailable parts are None or empty, and a sentence in `missing` gives the reason."""
 
     run: Run
     notes: dict
@@ -55,7 +55,7 @@ class Report:
 
 
 def gather(run: Run, reference: str | os.PathLike | None = None) -> Report:
-    """Reads, renders and scores what the page shows."""
+    """Read, render and score the content of the page."""
     report = Report(run, run.notes)
     missing = report.missing
     try:
@@ -88,7 +88,7 @@ def _metrics(file: Path, missing: list[str]) -> list[dict]:
     for line in lines:
         try:
             entry = json.loads(line)
-        except ValueError:  # a line that was torn when the run was killed
+        except ValueError:  # an incomplete line of a killed run
             continue
         if isinstance(entry, dict) and isinstance(entry.get("step"), int):
             entries.append(entry)
@@ -98,7 +98,8 @@ def _metrics(file: Path, missing: list[str]) -> list[dict]:
 
 
 def _evidence(scene: Scene, notes: dict, missing: list[str]) -> list[tuple[str, str]]:
-    """(what, figure) that the photographs and points say, measured now unless the run decided about effects by them."""
+    """Return (description, value) of the evidence in photographs and points, measured now; [] if the run used it to
+    decide about effects."""
     from linprim_geo.points.photo_evidence import observe
 
     if notes.get("effects"):
@@ -137,7 +138,7 @@ def _evidence(scene: Scene, notes: dict, missing: list[str]) -> list[tuple[str, 
 
 
 def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
-    """Scores of colours and depth, stored or taken now, and the pictures."""
+    """Set the scores of colours and depth, stored or computed now, and the images."""
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
 
@@ -171,7 +172,7 @@ def _score_views(report: Report, reference: str | os.PathLike | None) -> None:
 
 
 def _stored(run: Run, folder: Path, missing: list[str]) -> dict | None:
-    """Scores of the held-out views that eval-images or eval-depth left, unless the run went on since."""
+    """Return scores of the held-out views stored by eval-images or eval-depth, unless the run has saved since."""
     results = read_json(folder / "results.json", missing)
     if results is None or results.get("split") != "test":
         return None
@@ -180,7 +181,7 @@ def _stored(run: Run, folder: Path, missing: list[str]) -> dict | None:
 
 
 def _ranking(file: Path) -> list[str]:
-    """Names of the views from the worst PSNR to the best; empty if it is not known."""
+    """Return the names of the views from the worst PSNR to the best; empty if unknown."""
     try:
         with open(file, newline="", encoding="utf-8") as rows:
             return [row["name"] for row in sorted(csv.DictReader(rows), key=lambda row: float(row["psnr"]))]
@@ -189,7 +190,7 @@ def _ranking(file: Path) -> list[str]:
 
 
 def _chosen(views: tuple[View, ...], ranking: list[str]) -> list[View]:
-    """The worst and the best held-out view by PSNR and some evenly between; by name where that is not known."""
+    """Return the worst and the best held-out view by PSNR and some evenly in between; by name if PSNR is unknown."""
     by_name = {view.name: view for view in views}
     if set(ranking) != set(by_name):
         ranking = list(by_name)
@@ -238,7 +239,7 @@ def _pictures(report: Report, views: list[View]) -> list[ShownView]:
 
 
 def embedded_png(pixels: np.ndarray, most: int = PIXELS) -> tuple[str, int, int]:
-    """(data URI, width, height) of an image, averaged down to at most so many pixels along its longer side."""
+    """Return (data URI, width, height) of an image, downscaled to at most `most` pixels along its longer side."""
     from PIL import Image
 
     image = Image.fromarray(np.ascontiguousarray(pixels))
@@ -251,10 +252,10 @@ def embedded_png(pixels: np.ndarray, most: int = PIXELS) -> tuple[str, int, int]
 
 
 def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> list[str]:
-    """The command lines that make this run, its meshes and its scores again."""
+    """Return the command lines that reproduce this run, its meshes and its scores."""
     words = ["linprim-geo", "train", str(run.scene_path), "-o", str(run.path)]
     words += flags(run.scene_options) + flags(run.train_options)
-    # What the data called for is among the options: nothing is to be decided again.
+    # The effects chosen from the data are among the options, so that they are not chosen again.
     lines = [shlex.join([*words, "--effects", "none"])]
     for shown in report.meshes:
         try:
@@ -287,10 +288,10 @@ def commands(run: Run, report: Report, reference: str | os.PathLike | None) -> l
 
 
 def _extraction(run: Run, shown: ShownMesh) -> list[str]:
-    """The words that extract a mesh again; what was chosen automatically is spelled out.
+    """Return the words of the command that extracts a mesh again, with automatic choices written out.
 
     Raises:
-        LinprimError: its stats.json holds no options.
+        LinprimError: the mesh's stats.json holds no options.
     """
     where = f"stats.json of {shown.method}: options"
     options = from_saved(ExtractOptions, shown.stats.get("options"), where)

@@ -1,5 +1,5 @@
-"""The meshes of a run as a report shows them: found, scored against a reference, made light and packed for a
-browser."""
+"""Prepares the meshes of a run for a report: finds them, scores them against a reference, reduces them and packs them
+for a browser."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import METHODS
 from linprim_geo.surface.shaded_views import shaded_file
 
-# Triangles of all meshes of a page together: about 4 MB of it.
+# Largest number of triangles of all meshes of a page together, about 4 MB.
 MOST_FACES = 150_000
 HEADLINE = "headline"
-# Sine of the angle above the horizon that a mesh is first looked at from.
+# Sine of the elevation of the first view of a mesh.
 FIRST_LOOK = 0.4
 
 
 @dataclass
 class ShownMesh:
-    """One method's mesh: its statistics, the file that is shown, scores by protocol, `packed`, what the page's script
-    reads, and `shaded`, the picture that extraction left (`shaded_views`), (H, W, 3) uint8.
+    """The mesh of one method: its statistics, the displayed file, scores by protocol, `packed`, the input of the page's
+    script, and `shaded`, the image made by the extraction (`shaded_views`), (H, W, 3) uint8.
 
-    `problem` says what is missing or wrong, "" if nothing is.
+    `problem` describes what is missing or wrong, "" if nothing is.
     """
 
     method: str
@@ -48,10 +48,9 @@ class ShownMesh:
 
 
 def find_meshes(run: Run, reference: str | os.PathLike | None, missing: list[str]) -> list[ShownMesh]:
-    """Every mesh that RUN/mesh tells of, scored and ready to be shown; what is not there is said in `missing`.
+    """Return every mesh listed in RUN/mesh, scored and prepared for display; missing files are reported in `missing`.
 
-    Scores are those of RUN/eval/mesh that belong to the mesh; with `reference` they are taken anew where there are none
-    of it.
+    Scores are those in RUN/eval/mesh that belong to the mesh. With `reference`, missing scores against it are computed.
     """
     found = []
     for method in METHODS:
@@ -130,7 +129,7 @@ def _fill(
             )
     inside = bool(cameras) and is_inside(mesh, cameras)
     visible = path.with_name(f"{path.stem}_visible{path.suffix}")
-    if inside and visible.exists():  # what lies behind walls would hide the room
+    if inside and visible.exists():  # the parts behind the walls would hide the room
         path, mesh = visible, load_mesh(visible)
         shown.path = path
     light, rows, cell = light_mesh(mesh, most)
@@ -154,7 +153,7 @@ def _fill(
 
 
 def _shaded(path: Path, missing: list[str]) -> np.ndarray | None:
-    """The picture of a mesh, None where there is none: older versions made none."""
+    """Return the image of a mesh, None if there is none, as with older versions."""
     file = shaded_file(path)
     if not file.exists():
         missing.append(f"{file}: there is no picture of the mesh, extract-mesh makes one")
@@ -175,8 +174,8 @@ def pack(
     said: str,
     inside: bool,
 ) -> dict:
-    """What viewer.js reads: places as 16-bit shares of the box (V, 4; the last is padding), corners as 32-bit rows,
-    colours as bytes."""
+    """Return the input of viewer.js: positions as 16-bit shares of the bounding box (V, 4; the last is padding), faces
+    as 32-bit vertex indices, colours as bytes."""
     low, high = mesh.bounds
     size = high - low
     places = np.zeros((len(mesh.vertices), 4), "<u2")
@@ -185,8 +184,8 @@ def pack(
     if cameras:
         up = up_direction(cameras)
         middle = (low + high) / 2
-        # The first look is a camera's, from somewhat above; from inside there is no place to stand, so it is into the
-        # room from above.
+        # The first view is from the direction of a camera somewhat above. With cameras inside there is no such
+        # position, so it looks into the room from above.
         directions = np.stack([camera.center - middle for camera in cameras])
         steepness = directions @ up / np.maximum(np.linalg.norm(directions, axis=1), 1e-12)
         direction = directions[np.argmin(np.abs(steepness - FIRST_LOOK))] + (
@@ -220,7 +219,7 @@ def _text(values: np.ndarray) -> str:
 
 
 def mesh_file(run: Run, method: str, stats: dict) -> Path | None:
-    """The file that stats.json is about: where it was written, or in the run's folder if that was moved."""
+    """Return the mesh file of a stats.json: at its recorded path, or in the run's folder if that was moved."""
     name = Path(str(stats.get("mesh", "mesh.ply")))
     return next((place for place in (name, run.path / "mesh" / method / name.name) if place.is_file()), None)
 
@@ -231,13 +230,14 @@ def _reference_of(scores: dict, run: Run) -> Path | None:
 
 
 def refers_to(name: object, path: Path) -> bool:
-    """Whether a path that was noted, perhaps in another working folder, means this file."""
+    """Return whether a recorded path, perhaps relative to another working folder, is this file."""
     noted = Path(str(name or ""))
     return noted.resolve() == path.resolve() or (not noted.exists() and noted.parts[-3:] == path.parts[-3:])
 
 
 def read_json(file: Path, missing: list[str]) -> dict | None:
-    """The object in a JSON file; None if there is no file, and if it is damaged, which is said in `missing`."""
+    """Return the object in a JSON file; None if there is no file, or if it is damaged, which is reported in
+    `missing`."""
     if not file.exists():
         return None
     try:

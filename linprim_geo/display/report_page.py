@@ -1,5 +1,5 @@
-"""The page of a report: what the template page/report.html shows. One HTML file, well-formed XML as well, with its
-style, script, pictures and meshes inside."""
+"""The page of a report: fills the template page/report.html. The result is one HTML file, also well-formed XML, with
+its style, script, images and meshes embedded."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from linprim_geo.geometry.topology import topology_line
 from linprim_geo.imaging import plots
 from linprim_geo.training.effects import REASONS
 
-# The browser itself refuses whatever is not in the page.
+# With this policy, the browser refuses everything that is not in the page.
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 SECTIONS = (
     ("shaded", "The mesh, shaded"),
@@ -34,10 +34,10 @@ SECTIONS = (
     ("cost", "Time and memory"),
     ("repeat", "Versions, and how to repeat it"),
 )
-# Pixels along the longer side of the pictures that the page opens with, which are as wide as it is.
+# Longer side, in pixels, of the images at the top of the page, which have its full width.
 SHADED = 1440
-# Scores of a mesh: key, with a space before each that is looked up in what it gives, title, unit; lengths as a
-# percentage of the reference's diagonal.
+# Scores of a mesh: key (with spaces between the keys of nested tables), title, unit; lengths in % of the reference's
+# diagonal.
 MESH_SCORES = (
     ("chamfer_percent_diagonal", "Chamfer", "% diag."),
     ("accuracy_percent_diagonal", "accuracy", "% diag."),
@@ -51,7 +51,7 @@ MESH_SCORES = (
     ("shape creases recall", "creases found", ""),
     ("shape flatness rms_percent_diagonal", "flatness", "% diag."),
 )
-# Of the held-out views, with the digits to show; the first two are always there.
+# Scores of the held-out views, with the number of decimals; the first two always exist.
 IMAGE_SCORES = (
     ("psnr", "PSNR, dB", 2),
     ("ssim", "SSIM", 4),
@@ -72,7 +72,7 @@ DEPTH_SCORES = (
 
 @dataclass(frozen=True)
 class Page:
-    """The HTML, how many views it shows, of which methods it has meshes, and what it says is missing."""
+    """The HTML, the number of views, the methods of its meshes, and its list of what is missing."""
 
     html: str
     views: int
@@ -82,7 +82,7 @@ class Page:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the page: `kind` "figures" is set to the right, "words" to the left."""
+    """A table of the page: the `kind` "figures" is right-aligned, "words" left-aligned."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -91,11 +91,11 @@ class Table:
 
 
 def page(report: Report) -> Page:
-    """The page of a report."""
+    """Return the page of a report."""
     from markupsafe import Markup
 
     name = "/".join(report.run.path.resolve().parts[-2:])
-    # The script is part of the page as it is: nothing in it comes from a run.
+    # The script is inserted without escaping, as it contains nothing from a run.
     script = Markup((files(__package__) / "page" / "viewer.js").read_text(encoding="utf-8"))
     shown = [each for each in report.meshes if each.packed]
     scores, mesh_sources = _scores(report)
@@ -133,7 +133,7 @@ def page(report: Report) -> Page:
 
 
 def rendered(template: str, **values: object) -> str:
-    """The HTML of a template in the folder page, with the style sheet and the policy of every page."""
+    """Return the HTML of a template in the folder page, with the style sheet and the policy of all pages."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -150,7 +150,7 @@ def rendered(template: str, **values: object) -> str:
 
 
 def _cards(report: Report) -> list[tuple[str, str]]:
-    """The figures at the top, each with what it is."""
+    """Return the numbers at the top, each with its description."""
     cards = []
     if report.images:
         views = report.images.get("views")
@@ -172,7 +172,7 @@ def _cards(report: Report) -> list[tuple[str, str]]:
 
 
 def _facts(report: Report) -> Table | None:
-    """What the capture holds; None if it cannot be read any more."""
+    """Return a table of the capture's content; None if it can no longer be read."""
     scene = report.scene
     if scene is None:
         return None
@@ -201,7 +201,7 @@ def _facts(report: Report) -> Table | None:
 
 
 def _options(report: Report) -> Table:
-    """The options that differ from their defaults."""
+    """Return a table of the options that differ from their defaults."""
     rows = []
     for options in (report.run.scene_options, report.run.train_options):
         for entry in changed_options(options):
@@ -211,7 +211,7 @@ def _options(report: Report) -> Table:
 
 
 def _effects(report: Report) -> Table:
-    """The effects that were decided by the data."""
+    """Return a table of the effects that were decided by the data."""
     rows = []
     for each in report.notes.get("effects") or ():
         value = "not measured" if each.get("value") is None else f"{each['value']:.3g} {each.get('unit', '')}"
@@ -229,7 +229,7 @@ def _effects(report: Report) -> Table:
 
 
 def _plots(report: Report) -> list[str]:
-    """SVG elements of what was recorded during training."""
+    """Return SVG elements of the values recorded during training."""
     shown = []
     for title, unit, log, names in (
         ("loss", "", True, {"loss": "training"}),
@@ -252,7 +252,7 @@ def _plots(report: Report) -> list[str]:
 
 
 def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
-    """Tables of scores with their titles, and for each score of a mesh what it was measured by."""
+    """Return tables of scores with their titles, and for each score of a mesh how it was measured."""
     tables = []
     if report.images:
         images = report.images
@@ -261,7 +261,7 @@ def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
         for name, _, digits in shown:
             cells.append(_number(images.get(name), digits))
             error = images.get(f"{name}_standard_error")
-            if error is not None and math.isfinite(error):  # one view has none
+            if error is not None and math.isfinite(error):  # a single view has no standard error
                 cells[-1] += f" ± {_number(error, digits)}"
         head = (*(title for _, title, _ in shown), "views")
         caption = f"Protocol: {images.get('protocol')}."
@@ -295,14 +295,14 @@ def _scores(report: Report) -> tuple[list[tuple[str, Table]], list[str]]:
 
 
 def _looked_up(values: dict, key: str):
-    """The value of a key of `MESH_SCORES`, None where scores do not have it, as older ones."""
+    """Return the value of a key of `MESH_SCORES`; None in scores without it, such as older ones."""
     for name in key.split(" "):
         values = values.get(name) if isinstance(values, dict) else None
     return values
 
 
 def _stops() -> str:
-    """The colour map of errors as stops of a CSS gradient."""
+    """Return the colour map of errors as stops of a CSS gradient."""
     import numpy as np
 
     from linprim_geo.imaging.colors import error_colors
@@ -320,7 +320,7 @@ def _topology(shown: ShownMesh) -> str:
 
 
 def _cost(report: Report) -> Table:
-    """Seconds and memory of every job and stage."""
+    """Return a table of the seconds and memory of every job and stage."""
     peaks = [entry["memory_gib"] for entry in report.metrics if isinstance(entry.get("memory_gib"), int | float)]
     rows = []
     if report.state:

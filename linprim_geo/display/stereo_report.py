@@ -1,4 +1,4 @@
-"""Dense stereo with its page: depth in colours beside photographs, coverage, seconds."""
+"""Dense stereo with an HTML report: coloured depth next to photographs, coverage, seconds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from linprim_geo.display.report_page import Table, rendered
 from linprim_geo.imaging.colors import depth_preview, error_colors
 from linprim_geo.stereo.dense.dense import NOTES, Dense, run_stereo
 
-# Photographs that the page shows, evenly over the capture.
+# Number of photographs on the page, evenly spread over the capture.
 SHOWN = 8
 PAGE = "report.html"
 
@@ -32,18 +32,19 @@ def dense_stereo(
     resume: bool = False,
     quiet: bool = False,
 ) -> dict:
-    """Finds depth, normals and confidence of every photograph of a capture, and points out of all of them, and writes a
-    page about them, OUTPUT/report.html. `stereo.workspace` says which files there are.
+    """Compute depth, normals and confidence of every photograph of a capture, and a point cloud from all of them, and
+    write a report, OUTPUT/report.html. `stereo.workspace` describes the files.
 
-    With `resume` the folder's own options are used but for `threads` and `least_confidence`. With `time_budget`, in
-    seconds from now for everything, photographs are averaged down, then left out, by the speed of the first ones.
+    With `resume`, the options stored in the folder are used, except for `threads` and `least_confidence`. With
+    `time_budget`, in seconds from now for everything, photographs are downscaled, then left out, according to the
+    speed of the first ones.
 
     Returns: `output`, `points` (file), `report`, `photographs`, `downscale`, `count` (of points), `coverage` (share of
-    pixels with a depth), `probable` (share of pixels whose depth is right within 1 % with a probability of one half at
-    least), `seconds` and `peak_gib` of each stage.
+    pixels with a depth), `probable` (share of pixels whose depth is within 1 % with a probability of at least one
+    half), `seconds` and `peak_gib` of each stage.
 
     Raises:
-        LinprimError: the capture or an option cannot be used, or the folder exists already.
+        LinprimError: the capture or an option cannot be used, or the folder already exists.
     """
     begin = time.perf_counter()
     where = Path(scene), Path(output)
@@ -58,7 +59,7 @@ def dense_stereo(
 
 
 def describe(result: dict) -> str:
-    """What `dense_stereo` returns as one line."""
+    """Return the result of `dense_stereo` as one line."""
     rate = result["seconds"]["total"] / result["photographs"]
     return (
         f"{result['photographs']} photographs, {rate:.1f} s each: depth at {100 * result['coverage']:.0f} % of the "
@@ -106,7 +107,7 @@ def _page(dense: Dense) -> str:
 
 
 def _pictures(dense: Dense, k: int) -> list[tuple[str, str, int, int]]:
-    """(title, PNG as a data URI, width, height) of what there is of view k."""
+    """Return (title, PNG as a data URI, width, height) of the photograph and the maps of view k."""
     maps = dense.workspace.read_maps(k)
     known = maps.depth > 0
     normals = np.where(known[..., None], np.rint(127.5 * (1 - maps.normal)), 0).astype(np.uint8)
@@ -121,7 +122,7 @@ def _pictures(dense: Dense, k: int) -> list[tuple[str, str, int, int]]:
 
 
 def _command(dense: Dense) -> str:
-    """The command line that makes the folder again."""
+    """Return the command line that reproduces the folder."""
     notes = dense.notes
     words = ["linprim-geo", "stereo", notes["scene"], "-o", str(dense.workspace.root)]
     for kind, key in ((StereoOptions, "options"), (SceneOptions, "scene_options")):

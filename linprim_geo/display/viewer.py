@@ -1,5 +1,4 @@
-"""The interactive view of a run in a browser: primitives, meshes, cameras; served by viser, from this machine to this
-machine."""
+"""The interactive view of a run in a browser: primitives, meshes, cameras; served by viser, only to this machine."""
 
 from __future__ import annotations
 
@@ -29,28 +28,29 @@ from linprim_geo.geometry.mesh import Mesh, select_faces
 from linprim_geo.runs.run import Run
 
 HOST = "127.0.0.1"
-# Pages that may look, in a browser of this machine or through a tunnel to it, and what is no browser. Pages of other
-# sites in the same browser reach 127.0.0.1, too.
+# Origins of pages that may connect: on this machine or through a tunnel to it, and clients that are no browsers. Pages
+# of other sites in the same browser could reach 127.0.0.1 too.
 ORIGINS = (re.compile(r"http://(localhost|127\.0\.0\.1)(:\d+)?"), None)
 DEFAULT_PORT = 8080
-# Seconds between looks at the run's folder.
+# Interval of checks of the run's folder, seconds.
 LOOK_EVERY = 1.0
-# Who started a view that is to end with it: its process id, in the environment.
+# Environment variable with the id of the process with which a view ends.
 PARENT = "LINPRIM_GEO_VIEW_OF"
 NOTHING = "none"
 AXES = ("up", "x", "y", "z")
 TRAIN_COLOR, TEST_COLOR = (90, 110, 140), (220, 120, 30)
-# Size of a frustum and width of its lines in units of the training frame, where cameras stand about 3 from the middle.
+# Size of a frustum and width of its lines, in units of the training frame, in which cameras are about 3 from the
+# centre.
 FRUSTUM, FRUSTUM_LINE = 0.12, 0.005
-# The first look is that of the first camera, from so far behind and above it.
+# Distances of the first view behind and above the first camera.
 BEHIND, ABOVE = 0.6, 0.4
-# Light of an intensity of pi from everywhere shows colours as they are; some of it comes from two sides, so that shapes
-# can be told.
+# Light intensities. An intensity of pi from all directions would show colours unchanged; part of it comes from two
+# directions, so that shapes are visible.
 AMBIENT, FROM_ABOVE, FROM_BELOW = 1.9, 1.7, 0.9
 
 
 def check_installed() -> None:
-    """Raises LinprimError if viser, which is an extra, is not installed."""
+    """Raise LinprimError if viser, an optional dependency, is not installed."""
     try:
         import viser  # noqa: F401
     except ModuleNotFoundError as error:
@@ -67,15 +67,15 @@ def view_run(
     follow: bool = False,
     reference: str | os.PathLike | None = None,
 ) -> dict:
-    """Serves the view of a run until Ctrl-C.
+    """Serve the view of a run until Ctrl-C.
 
-    With `follow` it waits for a run that has not saved yet, and shows every save and every mesh as it comes. Only this
-    machine can reach it. With a `reference` mesh the true error of meshes can be shown too.
+    With `follow`, wait for a run that has not saved yet, and show every new save and mesh. Only this machine can
+    connect. With a `reference` mesh, the true error of meshes can be shown too.
 
     Returns: `address`, `loads` (how often the run was read), `seconds`.
 
     Raises:
-        LinprimError: viser is not installed, the port is taken, there is no such run (unless it is followed), or a file
+        LinprimError: viser is not installed, the port is in use, there is no such run (without `follow`), or a file
             is damaged.
     """
     start = time.perf_counter()
@@ -83,7 +83,7 @@ def view_run(
     viewer = Viewer(Path(run), port, follow=follow, reference=reference)
     address = viewer.address
     try:
-        _end_when_asked()  # before the line that tells others that it can be ended
+        _end_when_asked()  # before printing the line that tells other programs that the view is ready
         print(f"{address}: {viewer.status}; Ctrl-C ends it", file=sys.stderr, flush=True)
         if browser and _has_screen():
             import webbrowser
@@ -103,7 +103,7 @@ def view_run(
 
 @contextlib.contextmanager
 def watched(run: str | os.PathLike) -> Iterator[None]:
-    """Shows a run that is being trained in the block: a process of its own, which ends with the block, or with this
+    """Show a run that is being trained in the block, in a separate process that ends with the block or with this
     process.
 
     Raises:
@@ -111,7 +111,7 @@ def watched(run: str | os.PathLike) -> Iterator[None]:
     """
     check_installed()
     port = DEFAULT_PORT if _is_free(DEFAULT_PORT) else 0
-    # -P: no module comes from the folder this was called in, which may be a downloaded capture.
+    # -P: no module is imported from the current folder, which may be a downloaded capture.
     words = [sys.executable, "-P", "-m", "linprim_geo", "view", os.fspath(run), "--follow", "--port", str(port)]
     environment = os.environ | {PARENT: str(os.getpid())}
     child = subprocess.Popen(words, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -123,16 +123,16 @@ def watched(run: str | os.PathLike) -> Iterator[None]:
 
 
 class Viewer:
-    """A server with the scene and the controls of one run; `look` reads the run again if it has changed."""
+    """A server with the scene and the controls of one run."""
 
     def __init__(self, path: Path, port: int, *, follow: bool = False, reference: str | os.PathLike | None = None):
-        """`port` 0 takes any that is free."""
+        """`port` 0 selects any free port."""
         import viser
 
         self.path, self.reference = path, reference
         self.seen, self.loads = Seen(), 0
         self._stamps: dict[str, int] = {}
-        # Controls are served by threads; a scene is built by one at a time.
+        # Controls are served by several threads; only one of them builds a scene at a time.
         self._lock = threading.RLock()
         self._shown: dict[str, Any] = {}
         if not follow:
@@ -141,7 +141,7 @@ class Viewer:
         with _quiet(), _own_pages_alone():
             self.server = viser.ViserServer(host=HOST, port=port, label=f"linprim-geo: {path.name}", verbose=False)
         try:
-            if port and self.server.get_port() != port:  # taken since: viser goes on to the next
+            if port and self.server.get_port() != port:  # in use meanwhile, so viser has taken the next one
                 raise _taken(port)
             self.server.gui.configure_theme(show_share_button=False, show_logo=False, control_width="medium")
             self._controls()
@@ -155,7 +155,7 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Where a browser finds it."""
+        """The address for a browser."""
         return f"http://localhost:{self.server.get_port()}"
 
     @property
@@ -167,8 +167,8 @@ class Viewer:
         return f"{self.path}, step {self.seen.step}, {self.seen.count} primitives, {meshes}"
 
     def reload_if_saved(self) -> bool:
-        """Reads the run if it has saved since; whether it did. A run that is not there yet, or is being written, is
-        looked at later."""
+        """Read the run again if it has saved since; return whether it was read. A run that does not exist yet, or is
+        being written, is tried again later."""
         now = stamps(self.path)
         if not now or now == self._stamps or not any(name.endswith(".npz") for name in now):
             return False
@@ -180,7 +180,7 @@ class Viewer:
         return True
 
     def close(self) -> None:
-        """Ends the server."""
+        """Stop the server."""
         with _quiet():
             self.server.stop()
 
@@ -291,7 +291,7 @@ class Viewer:
                 if name.startswith(("/test/", "/train/")):
                     frustum.visible = self._test.value if name.startswith("/test/") else self._train.value
 
-    # --- what is drawn anew when a control or the run changes ---
+    # --- redrawn when a control or the run changes ---
 
     def _draw(self) -> None:
         with self._lock:
@@ -342,8 +342,8 @@ class Viewer:
         return (mesh if keep.all() else select_faces(mesh, keep)), chosen.inside
 
     def _kept(self, points: np.ndarray) -> np.ndarray:
-        """(P,) bool: on the side of the clipping plane that is kept, which has so many per cent of the primitives'
-        centres."""
+        """Return (P,) bool: which points are on the kept side of the clipping plane, which contains the selected
+        percentage of the primitives' centres."""
         share = self._plane.value / 100.0
         if share >= 1.0 or self.seen.primitives is None:
             return np.ones(len(points), dtype=bool)
@@ -353,14 +353,14 @@ class Viewer:
 
 
 def as_text(line: str) -> str:
-    """Markdown that shows the line as it is. Names and units come out of files, and viser runs scripts that stand in
+    """Return Markdown that shows the line literally. Names and units come from files, and viser runs scripts in
     Markdown."""
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(line.split()))
 
 
 def _glb(mesh: Mesh, double_sided: bool) -> bytes:
-    """GLB of a mesh with flat faces. Colours of vertices are linear there, so those of photographs are taken out of
-    sRGB."""
+    """Return a GLB of a mesh with flat faces. Its vertex colours are linear, so sRGB colours of photographs are
+    converted."""
     import trimesh
     from trimesh.visual.material import PBRMaterial
 
@@ -380,7 +380,7 @@ def _stand_at(camera: Camera, event) -> None:
 
 
 def _quaternion(rotation: np.ndarray) -> np.ndarray:
-    """(4,) w, x, y, z of a rotation matrix."""
+    """Return the (4,) quaternion w, x, y, z of a rotation matrix."""
     from scipy.spatial.transform import Rotation
 
     return np.roll(Rotation.from_matrix(rotation).as_quat(), 1)
@@ -388,7 +388,7 @@ def _quaternion(rotation: np.ndarray) -> np.ndarray:
 
 def _is_free(port: int) -> bool:
     with socket.socket() as probe:
-        if os.name == "posix":  # a port that was left a moment ago counts as free, as it does for the server
+        if os.name == "posix":  # a port released a moment ago counts as free, as it does for the server
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
@@ -411,13 +411,13 @@ def _taken(port: int) -> LinprimError:
 
 
 def _quiet() -> contextlib.AbstractContextManager:
-    """Keeps what viser prints about itself off the standard output, which is for results."""
+    """Discard viser's own messages on standard output, which is for results."""
     return contextlib.redirect_stdout(io.StringIO())
 
 
 @contextlib.contextmanager
 def _own_pages_alone() -> Iterator[None]:
-    """In the block viser starts servers that talk to pages of ORIGINS alone; it has no option for that."""
+    """Within the block, viser starts servers that accept pages of ORIGINS only; it has no option for that."""
     sockets: Any = import_module("websockets.asyncio.server")
     serve = sockets.serve
     sockets.serve = partial(serve, origins=ORIGINS)
@@ -428,7 +428,7 @@ def _own_pages_alone() -> Iterator[None]:
 
 
 def _end_when_asked() -> None:
-    """Lets a request to terminate end the view as Ctrl-C does: pycolmap, which reading a capture loads, would print a
+    """End the view on SIGTERM as on Ctrl-C. Otherwise pycolmap, which is loaded for reading a capture, would print a
     stack trace."""
 
     def end(number, frame):
@@ -439,5 +439,5 @@ def _end_when_asked() -> None:
 
 
 def _has_screen() -> bool:
-    """Whether a browser with a window can be opened; in a terminal alone one of letters would take it over."""
+    """Return whether a browser with a window can be opened; on a bare terminal, a text browser would take it over."""
     return sys.platform in ("darwin", "win32") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

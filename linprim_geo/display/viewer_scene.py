@@ -1,5 +1,5 @@
-"""What the viewer shows of a run: primitives, meshes and cameras, all in the training frame, where a scene has a handy
-size."""
+"""The content of the viewer: primitives, meshes and cameras of a run, all in the training frame, in which scenes have a
+normalized size."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.convert import MESH_SIGMAS
 from linprim_geo.surface.extract import METHODS
 
-# Triangles of the primitives, and of all meshes together: what a browser turns smoothly.
+# Largest numbers of triangles of the primitives, and of all meshes together, that a browser renders smoothly.
 MOST_PRIMITIVE_FACES, MOST_MESH_FACES = 400_000, 400_000
-# Photographs in the frusta, and their longer side in pixels.
+# Largest number of photographs shown in frusta, and their longer side in pixels.
 MOST_CAMERAS, PHOTO_PX = 60, 128
 
 
 @dataclass(frozen=True)
 class SeenMesh:
-    """A mesh in the training frame, light enough to be shown; `inside` if cameras stand in it; layers' lengths are the
-    data set's."""
+    """A mesh in the training frame, reduced for display; `inside` if cameras are inside of it. Lengths of its layers
+    are in the data set's unit."""
 
     mesh: Mesh
     layers: list[Layer]
@@ -40,8 +40,8 @@ class SeenMesh:
 
 @dataclass
 class Seen:
-    """Everything to show. `opacity` (N,) is of the `primitives`, the largest by area times opacity if all would be too
-    many of `count`."""
+    """The whole content. `opacity` (N,) is that of `primitives`; of `count` primitives, those with the largest area
+    times opacity are shown if all would be too many."""
 
     run: Run | None = None
     step: int = 0
@@ -55,17 +55,17 @@ class Seen:
 
 
 def stamps(path: Path) -> dict[str, int]:
-    """The files that a view depends on, with their times of change; without a run there are none."""
+    """Return the files that a view depends on, with their modification times; {} without a run."""
     files = [path / "training_frame.npz", *(path / "mesh" / method / "stats.json" for method in METHODS)]
     return {str(file): file.stat().st_mtime_ns for file in files if file.exists()}
 
 
 def load_seen(path: str | os.PathLike, before: Seen | None = None, reference: str | os.PathLike | None = None) -> Seen:
-    """Reads a run as it is now; the cameras are those of `before` as long as it is of the same capture in the same
+    """Read the present state of a run. The cameras are those of `before` if it is of the same capture in the same
     frame.
 
     Raises:
-        LinprimError: no run, nothing saved yet, or a damaged file.
+        LinprimError: there is no run, nothing is saved yet, or a file is damaged.
     """
     run = Run.open(path)
     seen = Seen(run=run, step=int(run.state.get("iteration", 0)))
@@ -92,7 +92,7 @@ def _capture(run: Run) -> tuple:
 
 
 def select(primitives: Primitives, rows: np.ndarray) -> Primitives:
-    """Some of the primitives."""
+    """Return some of the primitives."""
     return replace(
         primitives,
         **{name: getattr(primitives, name)[rows] for name in ("center", "rotation", "extent", "density", "sh")},
@@ -100,12 +100,12 @@ def select(primitives: Primitives, rows: np.ndarray) -> Primitives:
 
 
 def primitive_mesh(primitives: Primitives) -> Mesh:
-    """The primitives' faces with their colours; Gaussians are ellipsoids one standard deviation large."""
+    """Return the primitives' faces with their colours; Gaussians become ellipsoids of one standard deviation."""
     return primitives.triangle_mesh(sigmas=MESH_SIGMAS)
 
 
 def photo(view: View) -> np.ndarray:
-    """(h, w, 3) uint8 of a photograph, averaged down for a frustum; what its mask leaves out is white."""
+    """Return (h, w, 3) uint8 of a photograph, downscaled for a frustum; masked-out parts are white."""
     from PIL import Image
 
     from linprim_geo.imaging.metrics import composite
