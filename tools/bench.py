@@ -4,10 +4,10 @@ backward, and what the core can do at that moment.
 
     python tools/bench.py --primitives 50000 --threads 1 --json
 
-Primitives lie on the surfaces of a 6 x 3 x 5 m room with boxes and spheres, sized so that the number over a surface
-point does not depend on N; the camera looks in from the open front. Forward, backward and the limits alternate; figures
-are medians. The limits are of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare
-pair kernels of octahedra with all data in the first cache and every pixel hit (csrc/raster/machine_limits.h).
+Primitives are on the surfaces of a 6 x 3 x 5 m room with boxes and spheres. Their size is such that the number over a
+surface point does not depend on N. The camera looks in from the open front. Forward, backward and the limits alternate;
+results are medians. The limits are those of one thread and instruction set: peak multiply-adds, the vector exponential,
+and the bare pair kernels of octahedra with all data in the L1 cache and every pixel hit (csrc/raster/machine_limits.h).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 
 def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarray]:
-    """`count` flat octahedra on the room's surfaces: half-axes 2.6 s with s = overlap sqrt(area / count) in the
-    surface, 0.15 s across."""
+    """Return `count` flat octahedra on the room's surfaces: half-axes of 2.6 s in the surface with s = overlap
+    sqrt(area / count), and of 0.15 of that across."""
     rng = np.random.default_rng(seed)
     walls: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
@@ -66,7 +66,7 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
         ],
         1,
     )
-    # Quaternion that turns z to the normal, after a random spin about z.
+    # Quaternion that rotates z to the normal, after a random rotation about z.
     spin = rng.uniform(0, 2 * np.pi, count) / 2
     turn = np.concatenate([(1 + normal[:, 2])[:, None], np.cross([0.0, 0.0, 1.0], normal)], 1)
     turn[normal[:, 2] < -0.999999] = [0, 1, 0, 0]
@@ -85,20 +85,20 @@ def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarr
 
 
 def as_kind(arrays: dict[str, np.ndarray], kind: str) -> dict[str, np.ndarray]:
-    """The same room of Gaussians (half-axes are 2.6 standard deviations, opacity along the shortest) or tetrahedra of
-    equal volume."""
+    """Return the same room made of Gaussians (half-axes are 2.6 standard deviations, opacity along the shortest) or of
+    tetrahedra of equal volume."""
     if kind == "gaussian":
         opacity = -np.expm1(-2 * arrays["density"] * arrays["extent"].min(1))
         return arrays | {"extent": arrays["extent"] / np.float32(2.6), "density": opacity}
     if kind == "tetrahedron":
-        # 8 sqrt(3) / 27 r^3 of a regular tetrahedron of circumradius r against 4/3 a b c.
+        # The volume 8 sqrt(3) / 27 r^3 of a regular tetrahedron of circumradius r equals 4/3 a b c.
         radius = np.cbrt(arrays["extent"].prod(1) * (4 / 3) * 27 / (8 * np.sqrt(3)))
         return arrays | {"extent": np.repeat(radius[:, None], 4, 1).astype(np.float32)}
     return arrays
 
 
 def median_spread(values: list[float]) -> dict[str, float]:
-    """Median, and the range that holds the middle half."""
+    """Return the median and the quartiles."""
     low, middle, high = np.percentile(values, [25, 50, 75])
     return {"median": float(middle), "low": float(low), "high": float(high)}
 
@@ -106,7 +106,7 @@ def median_spread(values: list[float]) -> dict[str, float]:
 def measure(
     count: int, threads: int, runs: int, geometry: bool, variant: dict[str, str], width: int = 800, height: int = 600
 ) -> dict:
-    """Alternates forward, backward, loss, optimiser and the machine's limits `runs` times after two warm-ups.
+    """Time forward, backward, loss, optimiser and the machine's limits in turn, `runs` times after two warm-ups.
 
     `variant` holds the keywords primitive, ray_model and order of `ops.rasterize`.
     """

@@ -27,7 +27,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL is computed by the processor, so that no graphics card is needed.
+# WebGL is rendered in software, so that no graphics card is needed.
 FLAGS = (
     "--headless=new",
     "--use-gl=angle",
@@ -41,16 +41,16 @@ FLAGS = (
     "--hide-scrollbars",
 )
 START_SECONDS, ANSWER_SECONDS = 60, 120
-# A canvas with fewer colours than this shows nothing.
+# A canvas with fewer colours than this counts as blank.
 LEAST_COLORS = 12
 LONGEST_PX = 8000
-# A view's page builds its scene after it has loaded.
+# Waiting time for a view's page, which builds its scene after loading.
 VIEW_SECONDS = 10
 PHONE, DESK = (390, 844), (1280, 900)
 
 
 class Browser:
-    """A headless Chromium and one page of it, driven by its debugging protocol."""
+    """A headless Chromium with one page, controlled by its debugging protocol."""
 
     def __init__(self, folder: Path):
         program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
@@ -76,7 +76,7 @@ class Browser:
             raise
 
     def _address(self, folder: Path) -> str:
-        """Where the page can be talked to, as soon as the browser says it in its folder."""
+        """Return the address of the page's debugger, as soon as the browser has written its port to the folder."""
         port_file, until = folder / "DevToolsActivePort", time.monotonic() + START_SECONDS
         while not port_file.exists() or not port_file.read_text().strip():
             if self.process.poll() is not None or time.monotonic() > until:
@@ -87,7 +87,7 @@ class Browser:
             return next(each for each in json.load(answer) if each["type"] == "page")["webSocketDebuggerUrl"]
 
     def call(self, method: str, **parameters) -> dict:
-        """One call of the protocol; events that come meanwhile are kept."""
+        """Make one call of the protocol; events received meanwhile are kept."""
         self.count += 1
         self.socket.send(json.dumps({"id": self.count, "method": method, "params": parameters}))
         until = time.monotonic() + ANSWER_SECONDS
@@ -100,14 +100,14 @@ class Browser:
             self.events.append(message)
 
     def value(self, expression: str):
-        """What a JavaScript expression, or the promise it makes, comes to."""
+        """Return the value of a JavaScript expression, or of the promise that it returns."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
             raise RuntimeError(f"{expression[:80]}: {answer['exceptionDetails']}")
         return answer["result"].get("value")
 
     def open(self, address: str, size: tuple[int, int], dark: bool, seconds: float) -> None:
-        """Loads a page of so many pixels and lets it run so many seconds longer."""
+        """Load a page in a window of `size` pixels and let it run for `seconds` more."""
         self.events.clear()
         width, height = size
         self.call(
@@ -129,7 +129,7 @@ class Browser:
         self.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def complaints(self, address: str) -> list[str]:
-        """Errors and warnings of the console, exceptions, failed requests and requests to elsewhere, so far."""
+        """Return errors of the console, exceptions, failed requests and requests to other hosts or files, so far."""
         self.value("1")
         home, found = urllib.parse.urlsplit(address), []
         for event in self.events:
@@ -155,7 +155,8 @@ class Browser:
         return found
 
     def screenshot(self, whole: bool = False) -> bytes:
-        """PNG of the window, or of the whole page, smaller if that is longer than what Chromium draws in one piece."""
+        """Return a PNG of the window, or of the whole page, scaled down if it is longer than Chromium can draw at
+        once."""
         settings = {"format": "png"}
         if whole:
             self.value("window.scrollTo(0, 0)")
@@ -165,7 +166,7 @@ class Browser:
         return base64.b64decode(self.call("Page.captureScreenshot", **settings)["data"])
 
     def colors_of(self, element: int) -> int:
-        """How many colours the canvas of that number shows."""
+        """Return the number of colours in the canvas of that number."""
         import numpy as np
         from PIL import Image
 
@@ -178,13 +179,13 @@ class Browser:
             " return [b.x, b.y, b.right, b.bottom]; })()"
         )
         image = Image.open(io.BytesIO(self.screenshot())).convert("RGB").crop([round(side) for side in box])
-        # The middle, where controls that lie over a canvas do not count.
+        # Only the middle, to leave out controls over a canvas.
         width, height = image.size
         middle = np.asarray(image.crop((width // 4, height // 4, 3 * width // 4, 3 * height // 4)))
         return len(np.unique(middle.reshape(-1, 3), axis=0))
 
     def close(self) -> None:
-        """Ends the page's browser."""
+        """End the browser."""
         self.socket.close()
         self.process.terminate()
         try:
@@ -195,7 +196,7 @@ class Browser:
 
 @contextmanager
 def browser() -> Iterator[Browser]:
-    """A `Browser` with a profile of its own."""
+    """Yield a `Browser` with a new profile."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         opened = Browser(Path(folder))
         try:
@@ -215,8 +216,8 @@ def check(
     shot: Path | None = None,
     whole: bool = False,
 ) -> list[str]:
-    """What is wrong with a page: complaints, wider than its window, blank canvases; none at all if `canvas` asks for
-    one."""
+    """Return the faults of a page: complaints, content wider than the window, blank canvases, or no canvas if `canvas`
+    requires one."""
     opened.open(address, size, dark, seconds)
     found = []
     for element in range(opened.value("document.querySelectorAll('canvas').length")):
@@ -234,7 +235,7 @@ def check(
 
 
 def use_viewer(opened: Browser) -> list[str]:
-    """Turns the mesh of a report that is open, and switches its colours; what did not change the picture is a fault."""
+    """Rotate the mesh of the open report and switch its colours; return the actions that did not change the image."""
     found, canvas = [], "document.getElementById('view')"
     picture = f"new Promise(done => setTimeout(() => requestAnimationFrame(() => done({canvas}.toDataURL())), 100))"
     before = opened.value(picture)
@@ -260,7 +261,7 @@ def use_viewer(opened: Browser) -> list[str]:
 
 
 def check_report(opened: Browser, page: Path, folder: Path) -> list[str]:
-    """A report in light, dark, on a phone and on paper."""
+    """Check a report in light and dark mode and on a phone, and print it to PDF."""
     address, found = page.resolve().as_uri(), []
     for name, size, dark in (("light", DESK, False), ("dark", DESK, True), ("phone", PHONE, False)):
         faults = check(
@@ -299,7 +300,7 @@ def main() -> int:
 
 
 def check_all(opened: Browser, folder: Path) -> list[str]:
-    """Makes a tiny run with a mesh, its report and its view, and checks both."""
+    """Create a tiny run with a mesh, its report and its view, and check both."""
     from linprim_geo.base.options import TrainOptions
     from linprim_geo.display.report import report_run
     from linprim_geo.surface.extract import extract_mesh
@@ -316,7 +317,7 @@ def check_all(opened: Browser, folder: Path) -> list[str]:
 
 
 def check_view(opened: Browser, run: Path, reference: Path, folder: Path) -> list[str]:
-    """The view of a run: primitives, then its mesh by true error with all cameras."""
+    """Check the view of a run: primitives, then its mesh by true error with all cameras."""
     from linprim_geo.display.viewer import Viewer
 
     viewer = Viewer(run, 0, reference=reference)

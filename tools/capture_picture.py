@@ -17,12 +17,12 @@ QUALITY = 82
 
 
 def picture(run_path: Path, views: list[int], height: int, turn: int, crop: list[int] | None) -> np.ndarray:
-    """(3 rows, a column per view) of photograph, shaded mesh and coloured mesh as (H, W, 3) uint8.
+    """Return photographs, shaded meshes and coloured meshes (3 rows, a column per view) as (H, W, 3) uint8.
 
     Args:
-        height: of each of these, in pixels.
-        turn: quarter turns to the left; of photographs that were taken with the camera on its side.
-        crop: left, top, right and bottom of what is shown of a photograph, in pixels; None: all.
+        height: of each image, in pixels.
+        turn: quarter turns to the left, for photographs taken with the camera on its side.
+        crop: left, top, right and bottom of the displayed part of a photograph, in pixels; None: all.
     """
     from PIL import Image
 
@@ -56,7 +56,7 @@ def _cropped(image: np.ndarray, crop: list[int] | None) -> np.ndarray:
 
 
 def _joined(parts: list[np.ndarray], axis: int) -> np.ndarray:
-    """Images beside or above each other with a white gap between them."""
+    """Return images next to or above each other, with a white gap in between."""
     shape = list(parts[0].shape)
     shape[axis] = GAP_PX
     gap = np.full(shape, 255, np.uint8)

@@ -1,7 +1,7 @@
-"""Checks that packages import only those below them, and that no modules import each other in a circle.
+"""Checks that packages import only packages below them, and that there are no import cycles.
 
-The order stands in pyproject.toml, `[tool.importlinter]`. In the repository `linprim_geo.eval` lies in `eval/`, so the
-package is put together in a temporary folder first, as in the wheel. Imports inside functions count.
+The order is in pyproject.toml, `[tool.importlinter]`. In the repository `linprim_geo.eval` is in `eval/`, so the
+package is first assembled in a temporary folder, as in the wheel. Imports inside functions count.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def main() -> int:
         package = Path(folder) / "linprim_geo"
         shutil.copytree(ROOT / "linprim_geo", package)
         shutil.copytree(ROOT / "eval", package / "eval")
-        # An editable install finds the package in the repository, whatever the path says.
+        # The finder of an editable install would find the package in the repository, whatever the path.
         sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in type(finder).__module__]
         sys.path.insert(0, folder)
         os.chdir(folder)

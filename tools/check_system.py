@@ -1,8 +1,8 @@
 """Checks, before anything is installed, that this machine can build and run linprim-geo.
 
-Prints nothing and exits with 0 if all is there. Missing shared libraries are installed where this runs as
-root on a system with apt-get; else the line to run is printed and the exit status is 1. Standard library
-only.
+Prints nothing and exits with 0 if all requirements are met. Missing shared libraries are installed if this runs as
+root on a system with apt-get; otherwise the command to run is printed and the exit status is 1. Uses the standard
+library only.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from pathlib import Path
 
 
 def load_system():
-    """linprim_geo/base/system.py, by its path: the package itself cannot be imported before its dependencies are
-    there."""
+    """Return linprim_geo/base/system.py, loaded by its path, as the package cannot be imported without its
+    dependencies."""
     path = Path(__file__).resolve().parent.parent / "linprim_geo" / "base" / "system.py"
     spec = importlib.util.spec_from_file_location("linprim_geo_system", path)
     module = importlib.util.module_from_spec(spec)
@@ -51,7 +51,7 @@ def main() -> int:
         return fail(f"{names} missing; run: {'' if is_root else 'sudo '}{line}")
     print(f"check_system: installing what open3d and pymeshlab need ({names}): {line}", flush=True)
     environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    # The lists of a fresh image are empty or old, so a first failure is expected there.
+    # The package lists of a fresh image are empty or old, so a first failure is expected.
     if subprocess.run(command, env=environment, capture_output=True).returncode != 0:
         subprocess.run(["apt-get", "update"], env=environment, stdout=subprocess.DEVNULL)
         subprocess.run(command, env=environment, stdout=subprocess.DEVNULL)

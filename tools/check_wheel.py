@@ -2,10 +2,10 @@
 """Builds the sdist and, from it, the wheel; installs the wheel into a fresh environment and runs it there: `python
 tools/check_wheel.py`.
 
-The wheel is looked through for what it has to hold, then commands from `doctor` to `report` run in a folder of their
-own, with a PATH that has no compiler on it. --python chooses the interpreter (from 3.12 on the wheel serves every later
-Python too), --output keeps the two files, otherwise nothing is left. Downloads the libraries of constraints.txt; takes
-several minutes. Exit status: 0, or 1 with one sentence about the first thing that failed.
+The wheel is checked for its required content. Then commands from `doctor` to `report` run in a separate folder, with a
+PATH without a compiler. --python selects the interpreter (from 3.12 on the wheel also works with every later Python),
+--output keeps the two files; otherwise nothing is left. Downloads the libraries of constraints.txt; takes several
+minutes. Exit status: 0, or 1 with one sentence about the first failure.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-# The checkout's folders that become packages, and where.
+# The repository's folders with packages, and their paths in the wheel.
 PACKAGES = {"linprim_geo": "linprim_geo", "eval": "linprim_geo/eval"}
 NOT_PACKED = (".pyc", ".so", ".pyi")
-# Studies, which make tables for the documents, stay in the repository.
+# Studies, which make the tables of the documentation, are not in the wheel.
 STUDIES = ("linprim_geo/eval/studies/", "linprim_geo/eval/paper/")
 
 SMOKE = (
@@ -39,11 +39,11 @@ SMOKE = (
 
 
 class Failed(Exception):
-    """What failed, in one sentence."""
+    """A failed check; the message is one sentence."""
 
 
 def run(*words: str | Path, **settings) -> str:
-    """Runs a program and returns what it printed; Failed with the end of what it said if it fails."""
+    """Run a program and return its standard output; raise Failed with the end of its messages if it fails."""
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, **settings)
     if done.returncode:
         said = (done.stderr.strip() or done.stdout.strip()).splitlines()[-12:]
@@ -52,13 +52,13 @@ def run(*words: str | Path, **settings) -> str:
 
 
 def make_environment(python: str, folder: Path) -> Path:
-    """A fresh virtual environment; returns its interpreter."""
+    """Create a new virtual environment and return its interpreter."""
     run(python, "-m", "venv", folder)
     return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
 def build(python: Path, output: Path) -> tuple[Path, Path]:
-    """The sdist, and the wheel that is built from it."""
+    """Build the sdist, and the wheel from it; return both."""
     run(python, "-m", "pip", "install", "-qq", "build")
     run(python, "-m", "build", "--outdir", output, ROOT)
     (sdist,), (wheel,) = output.glob("*.tar.gz"), output.glob("*.whl")
@@ -66,8 +66,8 @@ def build(python: Path, output: Path) -> tuple[Path, Path]:
 
 
 def check_contents(wheel: Path) -> int:
-    """Every file of the packages but STUDIES is in the wheel, and the core, the entry point and the licence; returns
-    the number of files."""
+    """Check that every file of the packages except STUDIES is in the wheel, and the core, the entry point and the
+    licence; return the number of files."""
     packed = set(zipfile.ZipFile(wheel).namelist())
     for source, target in PACKAGES.items():
         for file in (ROOT / source).rglob("*"):
@@ -87,7 +87,7 @@ def check_contents(wheel: Path) -> int:
 
 
 def check_tag(python: Path, wheel: Path) -> None:
-    """From Python 3.12 on the wheel is of the stable interface."""
+    """Check that the wheel has the stable ABI from Python 3.12 on."""
     minor = int(run(python, "-c", "import sys; print(sys.version_info.minor)"))
     wanted = "-cp312-abi3-" if minor >= 12 else f"-cp3{minor}-cp3{minor}-"
     if wanted not in wheel.name:
@@ -95,7 +95,7 @@ def check_tag(python: Path, wheel: Path) -> None:
 
 
 def smoke(python: Path, folder: Path) -> None:
-    """Runs the installed package in `folder`, away from the checkout and from every compiler."""
+    """Run the installed package in `folder`, outside of the repository and without a compiler."""
     binary = python.parent
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "CC", "CXX")}
     environment |= {"PATH": str(binary), "LINPRIM_GEO_CACHE": str(folder / "cache")}

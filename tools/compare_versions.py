@@ -4,12 +4,12 @@
     python tools/compare_versions.py --before OLD/.venv/bin/linprim-geo --after .venv/bin/linprim-geo \\
         --scene office=DIR:REFERENCE --scene banana=DIR -o runs/compare --iterations 2000
 
-Each version trains each scene with each seed and, where a reference mesh is named, extracts the mesh; one ruler, the
-later version's `eval-mesh --run`, scores both. What the output folder holds of as many steps is not done again, so a
-comparison can be interrupted; another pair of versions needs another folder. `compare.md` and `compare.json` hold
-means over the seeds with standard deviations: PSNR of held-out photographs in dB, and Chamfer distance and normal
-consistency of the seen part, in % of the diagonal and as a cosine. A figure counts as worse if it is by more than twice
-the deviation of the difference of both means.
+Each version trains each scene with each seed. If a reference mesh is given, the mesh is extracted too, and both are
+scored by the later version's `eval-mesh --run`. Results in the output folder for the same number of steps are reused,
+so a comparison can be interrupted; use another folder for another pair of versions. `compare.md` and `compare.json`
+hold means over the seeds with standard deviations: PSNR of held-out photographs in dB, and Chamfer distance and normal
+consistency of the visible part, in % of the diagonal and as a cosine. A score counts as worse if it is worse by more
+than twice the standard deviation of the difference of both means.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.eval.study_tables import write_table
 
-# name: (heading, decimals, whether larger is better)
+# By name of the score: heading, decimals, whether larger is better.
 FIGURES = {
     "psnr": ("held out, dB", 2, True),
     "chamfer": ("Chamfer, %", 3, False),
@@ -38,7 +38,7 @@ FIGURES = {
 
 @dataclass(frozen=True)
 class SceneToCompare:
-    """A capture, and the mesh that it is scored against, if there is one."""
+    """A capture, and its reference mesh if there is one."""
 
     name: str
     folder: Path
@@ -54,7 +54,7 @@ class SceneToCompare:
 
 
 def run_json(command: list, log: Path) -> dict:
-    """The JSON object that a command prints; its messages go to `log`."""
+    """Run a command and return the JSON object that it prints; its messages go to `log`."""
     with log.open("a", encoding="utf-8") as messages:
         done = subprocess.run([str(part) for part in command], stdout=subprocess.PIPE, stderr=messages, text=True)
     if done.returncode:
@@ -63,12 +63,12 @@ def run_json(command: list, log: Path) -> dict:
 
 
 def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterations: int, folder: Path) -> dict:
-    """The figures of one version, scene and seed; from `folder`/figures.json where they are there."""
+    """Return the scores of one version, scene and seed, from `folder`/figures.json if that exists."""
     kept = folder / "figures.json"
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))
     run, log = folder / "run", folder / "log.txt"
-    shutil.rmtree(run, ignore_errors=True)  # what was interrupted
+    shutil.rmtree(run, ignore_errors=True)  # an interrupted training
     folder.mkdir(parents=True, exist_ok=True)
     one_thread = ["--threads", "1", "--json"]
     trained = run_json(
@@ -86,7 +86,7 @@ def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterat
 
 
 def row(scene: str, name: str, before: list[float], after: list[float]) -> dict:
-    """Means and deviations of one figure, and whether it is worse than their scatter."""
+    """Return means and deviations of one score, and whether the change for the worse exceeds their scatter."""
     means = np.mean(before), np.mean(after)
     deviations = [float(np.std(values, ddof=1)) for values in (before, after)]
     loss = (means[0] - means[1]) * (1 if FIGURES[name][2] else -1)

@@ -4,9 +4,9 @@ memory.
     python tools/fuzz.py --inputs 100000 --seed 0
     python tools/fuzz.py --only "mesh glb" --seed 0 --at 123      one input again, with its traceback; its file is kept
 
-An input is a whole file that was damaged by mutations drawn from (seed, reader, number). Readers run in a process of
-their own that may take 192 MiB more than it has, and that is started again after a crash; every input is on disk before
-it is tried. Exit status 1 if there is a finding.
+An input is a valid file damaged by mutations drawn from (seed, reader, number). Readers run in a separate process that
+may allocate 192 MiB more than it has, and that is restarted after a crash. Every input is written to disk before it is
+tried. Exit status 1 if there is a finding.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from pathlib import Path
 
 import numpy as np
 
-# Seconds on an idle machine after which reading one small file counts as a hang, bytes it may take, the longest that a
-# sentence may be.
+# Seconds on an idle machine after which reading one small file counts as a hang, bytes that it may allocate, and the
+# largest length of an error message.
 HANG, MEMORY, LONGEST = 5.0, 192 * 2**20, 2000
-# Seconds without any progress after which a process is ended that does not even answer its alarm.
+# Seconds without progress after which a process that does not react to its alarm is killed.
 STUCK = 30.0
 
 
@@ -39,7 +39,7 @@ class Hang(BaseException):
 
 
 class Case:
-    """The whole inputs of a reader in a folder of their own."""
+    """The valid inputs of a reader, in a folder of their own."""
 
     def __init__(self, reader, folder: Path):
         self.reader = reader
@@ -51,7 +51,7 @@ class Case:
             self.restore(path)
 
     def damage(self, seed: int, number: int) -> Path:
-        """Writes input `number` in place of a whole file, which is returned."""
+        """Write input `number` in place of a valid file; return its path."""
         from fuzz_inputs import mutate
 
         rng = np.random.default_rng([seed, zlib.crc32(self.reader.name.encode()), number])
@@ -60,12 +60,12 @@ class Case:
         return path
 
     def restore(self, path: Path) -> None:
-        """Puts the whole file back."""
+        """Restore the valid file."""
         path.write_bytes(self.whole[path])
 
 
 def attempt(case: Case, path: Path) -> tuple[str, str]:
-    """(read, refused or a finding's name, what was said)."""
+    """Return (read, refused or the name of a finding, the message)."""
     from linprim_geo.base.errors import LinprimError
 
     signal.setitimer(signal.ITIMER_REAL, _on_this_machine(HANG))
@@ -88,7 +88,7 @@ def attempt(case: Case, path: Path) -> tuple[str, str]:
 
 
 def _place(trace) -> str:
-    """The innermost line of the package in a traceback."""
+    """Return the innermost line of the package in a traceback."""
     frames = [
         frame for frame in traceback.extract_tb(trace) if "linprim_geo" in frame.filename or "fuzz_" in frame.filename
     ]
@@ -96,7 +96,7 @@ def _place(trace) -> str:
 
 
 def _on_this_machine(seconds: float) -> float:
-    """Seconds of an idle machine on one whose cores have several processes each to run."""
+    """Convert seconds on an idle machine to this machine, whose cores may each run several processes."""
     from linprim_geo.base.cores import usable_cores
 
     return seconds * max(1.0, os.getloadavg()[0] / usable_cores())
@@ -107,8 +107,8 @@ def _alarm(*_):
 
 
 def work(names: list[str], counts: list[int], seed: int, start: int, folder: Path) -> None:
-    """The process that reads: inputs from `start` of the first reader on; counts and findings go to a file in
-    `folder`."""
+    """Read inputs, from `start` of the first reader on, in the reading process; counts and findings are written to a
+    file in `folder`."""
     import resource
 
     _prepare(folder)
@@ -117,7 +117,7 @@ def work(names: list[str], counts: list[int], seed: int, start: int, folder: Pat
         for name, count in zip(names, counts, strict=True):
             resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
             case = _case(name, folder)
-            # Again for every reader: what those before it have left behind is not its own.
+            # Set again for every reader, as memory left over by earlier ones does not count.
             size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
             resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
             seen = {"read": 0, "refused": 0}
@@ -141,7 +141,7 @@ def work(names: list[str], counts: list[int], seed: int, start: int, folder: Pat
 def _prepare(folder: Path) -> None:
     os.environ["LINPRIM_GEO_CACHE"] = str(folder / "cache")
     warnings.simplefilter("ignore")
-    # All at once, so that the limit on memory is not taken up by libraries.
+    # Everything is imported now, so that libraries do not count towards the memory limit.
     import pycolmap  # noqa: F401
     import scipy.io  # noqa: F401
     import torch
@@ -164,7 +164,7 @@ def _case(name: str, folder: Path) -> Case:
 
 
 def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[str, dict]:
-    """{reader: read, refused, and a list of findings}, from as many processes, one after the other, as it takes."""
+    """Return {reader: read, refused, and a list of findings}, from as many successive processes as are needed."""
     table = {
         name: {"inputs": count, "read": 0, "refused": 0, "findings": []}
         for name, count in zip(names, counts, strict=True)
@@ -198,14 +198,14 @@ def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[st
         shutil.copy(path, folder / f"crash_{name.replace(' ', '_')}_{number}{Path(path).suffix}")
         kind = "hang" if status == -signal.SIGKILL else "crash"
         table[name]["findings"].append({"reader": name, "finding": kind, "said": said, "number": number})
-        # What was counted since the last note is lost with the process.
+        # The counts since the last record are lost with the process.
         table[name]["read"] += max(0, number - done[name] - 1)
         first, start = names.index(name), number + 1
     return table
 
 
 def _watch(process: subprocess.Popen, current: Path) -> int:
-    """Waits for the process and kills it when nothing changes any more; returns its status."""
+    """Wait for the process, and kill it if it makes no more progress; return its status."""
     while True:
         try:
             return process.wait(timeout=1.0)
@@ -216,7 +216,7 @@ def _watch(process: subprocess.Popen, current: Path) -> int:
 
 
 def show(table: dict[str, dict]) -> str:
-    """The table and, under it, every different finding with the first input that shows it."""
+    """Return the table and below it every distinct finding with the first input that shows it."""
     lines = [f"{'reader':18}{'inputs':>9}{'refused':>9}{'read':>9}{'findings':>10}"]
     for name, row in table.items():
         lines.append(f"{name:18}{row['inputs']:9}{row['refused']:9}{row['read']:9}{len(row['findings']):10}")
@@ -236,7 +236,7 @@ def show(table: dict[str, dict]) -> str:
 
 
 def again(name: str, seed: int, number: int) -> int:
-    """Tries one input in this process; keeps its file and shows where it ends."""
+    """Try one input in this process; keep its file, and show the result."""
     folder = Path(tempfile.mkdtemp(prefix="fuzz_"))
     _prepare(folder)
     case = _case(name, folder)

@@ -1,4 +1,4 @@
-"""Whole captures, files of protocols and runs, and what a correct result of reading one looks like."""
+"""Valid captures, protocol files and runs for the fuzzer, and checks of the results of reading them."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def make_colmap(folder: Path, text: bool) -> None:
             track.add_element(number, row)
         model.add_point3D(np.array([row, 1.0, 2.0]), track, np.array([1, 2, 3], np.uint8))
     (model.write_text if text else model.write_binary)(str(folder))
-    # Models of old, without rigs and frames.
+    # Models in the old format, without rigs and frames.
     old = folder / "old"
     old.mkdir()
     for path in folder.glob("*.*"):
@@ -166,7 +166,7 @@ def make_tum(folder: Path) -> None:
     for name, mode in (("rgb", "RGB"), ("depth", "I;16")):
         (folder / name).mkdir()
         for number in range(3):
-            # Without a file of intrinsics photographs have the PrimeSense's size.
+            # Without a file of intrinsics, photographs must have the size of the PrimeSense camera.
             Image.new(mode, (640, 480), 9).save(folder / name / f"{number}.png")
             lists[name].append(f"{number / 30:.6f} {name}/{number}.png")
     for number, pose in enumerate(_poses(3)):

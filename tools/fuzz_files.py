@@ -1,4 +1,4 @@
-"""Whole files of primitives, points, meshes and images, and what a correct result of reading one looks like."""
+"""Valid files of primitives, points, meshes and images for the fuzzer, and checks of the results of reading them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 
 class Wrong(AssertionError):
-    """A reader returned something that is not finite or does not fit together."""
+    """A result of a reader that is not finite or not consistent."""
 
 
 def check(condition: bool, what: str) -> None:
-    """Raises Wrong unless the condition holds."""
+    """Raise Wrong unless the condition holds."""
     if not condition:
         raise Wrong(what)
 

@@ -1,5 +1,5 @@
-"""Damaged inputs out of whole ones: seeded mutations of bytes, of text, of JSON, and of the formats that checksums or
-lengths protect."""
+"""Damages valid inputs by seeded mutations of bytes, of text, of JSON, and of formats protected by checksums or
+lengths."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import zlib
 
 import numpy as np
 
-# What counts, sizes and offsets become.
+# Replacements for counts, sizes and offsets.
 WHOLE = (
     0,
     1,
@@ -154,7 +154,7 @@ VALUES = (
 
 
 def mutate(rng: np.random.Generator, data: bytes, kind: str) -> bytes:
-    """One to three mutations of a file of a `kind`: ply, text, json, zip, npy, png, glb or binary."""
+    """Apply one to three mutations to a file of a `kind`: ply, text, json, zip, npy, png, glb or binary."""
     aware = {"ply": _ply, "text": _text, "json": _json, "zip": _zip, "png": _png, "glb": _glb, "npy": _npy}.get(kind)
     for _ in range(int(rng.integers(1, 4))):
         data = aware(rng, data) if aware is not None and rng.random() < 0.65 else _bytes(rng, data)
@@ -166,13 +166,13 @@ def _pick(rng: np.random.Generator, values):
 
 
 def _span(rng: np.random.Generator, size: int) -> tuple[int, int]:
-    """A piece of so many bytes: anywhere, mostly short."""
+    """Return start and end of a random span within `size` bytes, mostly short."""
     start = int(rng.integers(0, size + 1))
     return start, min(size, start + int(2 ** rng.uniform(0, 10)))
 
 
 def _number(rng: np.random.Generator) -> bytes:
-    """An odd number in binary, of any type and order."""
+    """Return an unusual number in binary, of random type and byte order."""
     order = _pick(rng, "<>")
     if rng.random() < 0.5:
         code = _pick(rng, "fd")
@@ -204,7 +204,7 @@ def _bytes(rng: np.random.Generator, data: bytes) -> bytes:
         return data[:start] + data[other:stop] + data[end:]
     if what == 6:
         return data + rng.bytes(int(2 ** rng.uniform(0, 8)))
-    # Numbers lie at the front more often than anywhere else: headers.
+    # Half of the numbers are placed at the front, where headers are.
     place = int(rng.integers(0, min(len(data), 256) + 1)) if rng.random() < 0.5 else start
     number = _number(rng)
     return data[:place] + number + data[place + len(number) :]
@@ -234,7 +234,7 @@ def _text(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _ply(rng: np.random.Generator, data: bytes) -> bytes:
-    """The header as text; what follows stays."""
+    """Mutate the header as text; the rest stays unchanged."""
     end = data.find(b"end_header\n")
     if end < 0:
         return _bytes(rng, data)
@@ -254,7 +254,7 @@ def _json(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _change(rng: np.random.Generator, value) -> None:
-    """Changes one entry somewhere inside of a list or table."""
+    """Change one entry somewhere in a nested list or dict."""
     while isinstance(value, (dict, list)) and value:
         key = _pick(rng, list(value)) if isinstance(value, dict) else int(rng.integers(len(value)))
         if isinstance(value[key], (dict, list)) and value[key] and rng.random() < 0.8:
@@ -273,12 +273,12 @@ def _change(rng: np.random.Generator, value) -> None:
 
 
 def _zip(rng: np.random.Generator, data: bytes) -> bytes:
-    """Members changed, removed, doubled or renamed, with checksums that fit; arrays and pickles inside are bytes like
-    others."""
+    """Change, remove, duplicate or rename members, with valid checksums; arrays are also mutated as such, other members
+    as bytes."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [(info.filename, archive.read(info)) for info in archive.infolist()]
-    except Exception:  # noqa: BLE001 - what an earlier mutation has broken
+    except Exception:  # noqa: BLE001 - broken by an earlier mutation
         return _bytes(rng, data)
     if not members:
         return data
@@ -315,7 +315,7 @@ def _zip(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _enormous_header(rng: np.random.Generator) -> bytes:
-    """The start of a .npy file of 256 MiB, in an array or in the header itself."""
+    """Return the start of a .npy file of 256 MiB, in an array or in the header itself."""
     if rng.random() < 0.2:
         return b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**28)
     shape = _pick(rng, ((2**26,), (2**24, 4), (2**13, 2**13), (2**24, 4, 1)))
@@ -324,11 +324,11 @@ def _enormous_header(rng: np.random.Generator) -> bytes:
 
 
 def _npy(rng: np.random.Generator, content: bytes) -> bytes:
-    """An array of another type, shape or values, or with a header that says so alone."""
+    """Return an array of another type, shape or values, or with a header that only declares so."""
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
         array = array if array.dtype.kind in "fiub" else array.astype("<U30")
-    except Exception:  # noqa: BLE001 - what an earlier mutation has broken
+    except Exception:  # noqa: BLE001 - broken by an earlier mutation
         return _bytes(rng, content)
     what = int(rng.integers(5))
     if what == 0:
@@ -359,7 +359,8 @@ def _npy(rng: np.random.Generator, content: bytes) -> bytes:
 
 
 def _png(rng: np.random.Generator, data: bytes) -> bytes:
-    """Chunks removed, doubled, swapped or changed, with checksums that fit; a size that is far from the pixels."""
+    """Remove, duplicate, rename or change chunks, with valid checksums, or declare a size that differs from the
+    pixels."""
     chunks, place = [], 8
     while place + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, place)
@@ -392,7 +393,7 @@ def _png(rng: np.random.Generator, data: bytes) -> bytes:
 
 
 def _glb(rng: np.random.Generator, data: bytes) -> bytes:
-    """The JSON inside, with lengths that fit."""
+    """Mutate the JSON chunk, with matching lengths."""
     if len(data) < 20 or data[:4] != b"glTF":
         return _bytes(rng, data)
     (length,) = struct.unpack_from("<I", data, 12)

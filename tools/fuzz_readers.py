@@ -1,5 +1,5 @@
-"""Every reader of the package: whole inputs for it, which of them are damaged and how, and the check of what is
-read."""
+"""All readers of the package for the fuzzer: valid inputs, the files to damage with their kinds, and checks of the
+results."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import fuzz_files as files
 
 @dataclass(frozen=True)
 class Reader:
-    """`make` writes whole inputs into a folder; `files` are those that are damaged, each with its kind of mutation;
-    `read` reads what one of them belongs to and checks the result."""
+    """`make` writes valid inputs to a folder; `files` are those that are damaged, each with its kind of mutation;
+    `read` reads the input that one of them belongs to, and checks the result."""
 
     name: str
     make: Callable[[Path], None]

@@ -26,7 +26,7 @@ from sanitize import ROOT, build, run_pytest
 
 from linprim_geo.base.cores import usable_cores
 
-# After this many seconds tests that run on a wrong core are ended, which counts as noticed.
+# Seconds after which tests on a mutated core are stopped, which counts as noticing the mutation.
 PATIENCE = 900
 
 
@@ -41,7 +41,7 @@ class Mutation(NamedTuple):
     tests: tuple[str, ...]  # under tests/
 
 
-# What is compiled less in the copy.
+# Parts that are left out of the build of the copy.
 REDUCTIONS = (
     Edit("CMakeLists.txt", "  linprim_kernels(v2 -msse4.2 -mpopcnt)\n", ""),
     Edit(
@@ -51,7 +51,7 @@ REDUCTIONS = (
         "",
     ),
     Edit("CMakeLists.txt", "INTERFACE -O3)", "INTERFACE -O1)"),
-    # Single precision by "scalar" is the AVX2 kernels under that name.
+    # "scalar" in single precision is the AVX2 kernels under that name.
     Edit(
         "csrc/raster/kernels.cpp",
         "template <>\nconst Kernels<float>& kernels_scalar<float>() {\n  return LINPRIM_ISA::table<float>;\n}\n",
@@ -84,7 +84,7 @@ def _in(file: str, snippet: str, replacement: str, tests: tuple[str, ...]) -> Mu
 
 
 MUTATIONS = {
-    # Blending by the order of centres.
+    # Blending in the order of centres.
     "median-gradient-beyond": _in(
         "raster/blend_center.h",
         "select(hit & (v_level < after), g_median",
@@ -103,7 +103,7 @@ MUTATIONS = {
     "thin-slope-series": _in(
         "raster/tile.h", "series(Real(-1.0 / 12), Real(1.0 / 240),", "series(Real(-1.0 / 12), Real(1.0 / 720),", CENTER
     ),
-    # By entries.
+    # Blending in the order of entries.
     "entry-last-weight": _in(
         "raster/blend_sorted.h",
         "P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)), P.pair_pixels[slot] += count;",
@@ -116,7 +116,7 @@ MUTATIONS = {
         "return nearest - kDepthSlack",
         LADDER,
     ),
-    # By overlap.
+    # Blending by overlap.
     "overlap-variance": _in(
         "raster/blend_overlap.h", "fma(dz, dz, zero - length_here * length_here * slope)", "dz * dz", LADDER
     ),
@@ -240,7 +240,7 @@ MUTATIONS = {
 
 
 def edited(text: str, edit: Edit, what: str) -> str:
-    """`text` with the edit; SystemExit where the snippet is not there exactly once."""
+    """Return `text` with the edit; SystemExit if the snippet does not occur exactly once."""
     found = text.count(edit.snippet)
     if found != 1:
         raise SystemExit(f"mutate_core: the snippet of {what} is {found} times in {edit.file}, wanted once")
@@ -248,14 +248,14 @@ def edited(text: str, edit: Edit, what: str) -> str:
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """A file that stays as it is keeps its time, so that nothing is compiled for it."""
+    """Write a file only if its text differs, so that unchanged files keep their time and are not compiled again."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
 
 
 class Copy:
-    """The core's sources and build in a folder of their own."""
+    """A copy of the core's sources and its build, in a separate folder."""
 
     def __init__(self, folder: Path, jobs: int) -> None:
         self.folder, self.source, self.jobs = folder, folder / "source", jobs
@@ -280,7 +280,7 @@ class Copy:
             raise SystemExit(f"mutate_core: the build failed:\n{error.stdout[-3000:]}{error.stderr[-3000:]}") from None
 
     def first_failure(self, module: Path, tests: Sequence[str]) -> str | None:
-        """The first test of these files that fails, or what else ended them; None where all pass."""
+        """Return the first failing test of these files, or another cause of their end; None if all pass."""
         arguments = [
             "-x",
             "-q",
@@ -305,7 +305,7 @@ class Copy:
         raise SystemExit(f"mutate_core: pytest did not run:\n{(done.stdout + done.stderr)[-3000:]}")
 
     def noticed_by(self, mutation: Mutation) -> str | None:
-        """The test that fails with the mutation; None where it survives."""
+        """Return the test that fails with the mutation; None if it survives."""
         file = mutation.edit.file
         path = self.source / file
         path.write_text(edited(self.text[file], mutation.edit, file))

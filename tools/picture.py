@@ -13,7 +13,8 @@ import numpy as np
 
 
 def picture(run_path: Path, views: list[int], mesh_path: Path | None) -> np.ndarray:
-    """(rows, 5 columns) of photograph, render, median depth, normal and shaded mesh as (H, W, 3) uint8."""
+    """Return photograph, render, median depth, normal and shaded mesh (5 columns, a row per view) as (H, W, 3)
+    uint8."""
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.imaging.colors import depth_preview
     from linprim_geo.imaging.metrics import composite
@@ -40,7 +41,7 @@ def picture(run_path: Path, views: list[int], mesh_path: Path | None) -> np.ndar
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """uint8 of an image in [0, 1]."""
+    """Convert an image in [0, 1] to uint8."""
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 

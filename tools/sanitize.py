@@ -34,11 +34,11 @@ TESTS = (
     "eval/test_stability.py",
     "kernels/test_photometric.py",
 )
-# `opcheck` traces through a compiler of its own, and a forked child has none of the sanitizers' threads.
+# `opcheck` traces with a compiler of its own, and a forked child has none of the sanitizers' threads.
 SKIPPED = "not registered_correctly and not forked"
 
-# The module built here under the installed one's name, before anything imports the package: an editable install's
-# finder comes before PYTHONPATH, sys.modules before both.
+# Loads the module built here under the installed one's name before anything imports the package: the finder of an
+# editable install has precedence over PYTHONPATH, and sys.modules over both.
 RUNNER = """
 import importlib.util, sys
 spec = importlib.util.spec_from_file_location("linprim_geo._core", sys.argv[1])
@@ -56,8 +56,8 @@ sys.exit(pytest.main(sys.argv[2:]))
 
 
 def build(folder: Path, jobs: int, options: list[str], source: Path = ROOT, **how: Any) -> Path:
-    """Builds the core of `source` in `folder` with these options of CMake; returns the module. `how` goes to
-    subprocess.run. Raises CalledProcessError where that fails."""
+    """Build the core of `source` in `folder` with these options of CMake; return the module. `how` is passed to
+    subprocess.run. Raises CalledProcessError if that fails."""
     python = sys.executable
     nanobind = subprocess.run(
         [python, "-m", "nanobind", "--cmake_dir"], check=True, capture_output=True, text=True
@@ -76,8 +76,8 @@ def build(folder: Path, jobs: int, options: list[str], source: Path = ROOT, **ho
 
 
 def runtimes(folder: Path) -> str:
-    """LD_PRELOAD of the sanitizers' runtimes of the compiler that built `folder`, and the C++ library they hook
-    into."""
+    """Return LD_PRELOAD with the sanitizers' runtimes of the compiler that built `folder`, and the C++ library that
+    they hook into."""
     cache = (folder / "CMakeCache.txt").read_text()
     compiler = next(line.split("=", 1)[1] for line in cache.splitlines() if line.startswith("CMAKE_CXX_COMPILER:"))
     names = ("libasan.so", "libubsan.so", "libstdc++.so.6")
@@ -96,8 +96,8 @@ def runtimes(folder: Path) -> str:
 
 
 def run_pytest(module: Path, folder: Path, arguments: list[str], environment: dict[str, str], **how: Any) -> Any:
-    """Runs pytest with `module` in the place of the installed core; returns what subprocess.run does. Writes the
-    program that does so to `folder`."""
+    """Run pytest with `module` in place of the installed core; return the result of subprocess.run. The program for
+    this is written to `folder`."""
     environment = os.environ | environment
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     environment.setdefault("OMP_NUM_THREADS", "1")
@@ -107,10 +107,10 @@ def run_pytest(module: Path, folder: Path, arguments: list[str], environment: di
 
 
 def test(module: Path, folder: Path, arguments: list[str]) -> int:
-    """Runs pytest on the module under the sanitizers; returns its exit status."""
+    """Run pytest on the module under the sanitizers; return its exit status."""
     environment = {
         "LD_PRELOAD": runtimes(folder),
-        # Python leaves memory to the system at its end, so leaks say nothing; threads of torch outlive their stacks.
+        # Python does not free all memory at exit, so leaks mean nothing; threads of torch outlive their stacks.
         "ASAN_OPTIONS": "detect_leaks=0:halt_on_error=1:abort_on_error=0:exitcode=99:detect_stack_use_after_return=0",
         "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1:exitcode=99",
     }
