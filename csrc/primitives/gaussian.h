@@ -39,13 +39,13 @@ struct Gaussian {
   static constexpr bool kVolume = false;
   static constexpr int kColorSums = 16, kGeometrySums = 32;
 
-  struct Meeting {
+  struct Intersection {
     V dx, dy, falloff, alpha;
     I in_face;  // the one normal
   };
 
   template <bool kTrack>
-  static M meet(const Record& r, const View&, V x, V y, V, Meeting& m) {
+  static M intersect(const Record& r, const View&, V x, V y, V, Intersection& m) {
     m.dx = x - V::set(r.mean_x), m.dy = y - V::set(r.mean_y);
     const V half = V::set(Real(0.5));
     const V distance =
@@ -56,18 +56,18 @@ struct Gaussian {
     m.in_face = I::set(0);
     return m.alpha >= V::set(Real(kSmallestAlpha));
   }
-  static V thickness(const Record&, V, M hit, Meeting& m) {
+  static V thickness(const Record&, V, M hit, Intersection& m) {
     return select(hit, min(m.alpha, V::set(Real(kLargestAlpha))), V::set(0));
   }
   static void attenuate(const Record&, V absorbed, V& alpha, V& through) {
     alpha = absorbed, through = V::set(1) - absorbed;
   }
-  static void depths(const Record& r, V, const Meeting&, V& t_in, V& t_out) { t_in = t_out = V::set(r.w0); }
+  static void depths(const Record& r, V, const Intersection&, V& t_in, V& t_out) { t_in = t_out = V::set(r.w0); }
 
   // With g the gradient to the exponent: adds the sums of g dx dx, g dx dy, g dy dy, g dx, g dy at 0-4; d_tau is the
   // gradient to -ln(1 - alpha).
   template <class Kind, bool kDistance>
-  static void add_gradient(const Record&, const Meeting& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V,
+  static void add_gradient(const Record&, const Intersection& m, M hit, V, V through, V d_tau, V d_in, V d_out, V, V, V,
                            V* sums) {
     const M free = hit & (m.alpha < V::set(Real(kLargestAlpha)));
     const V d_alpha = select(free, d_tau * rcp(through), V::set(0)), g = d_alpha * m.alpha;

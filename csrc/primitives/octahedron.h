@@ -28,12 +28,12 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   using V = typename Base::V;
   using M = typename Base::M;
   using I = typename Base::I;
-  using Meeting = typename Base::Meeting;
+  using Intersection = typename Base::Intersection;
 
   // Computes the planes where the rays enter and leave; x and y are in pixels relative to the record's reference.
   // kTrack: also which faces.
   template <bool kTrack>
-  static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
+  static M intersect(const Record& r, const View& view, V x, V y, V, Intersection& m) {
     auto value = [&](int f) { return fma(V::set(r.b[f]), x, fma(V::set(r.c[f]), y, V::set(r.a[f]))); };
     auto enter = [&](V w, int f) {
       if constexpr (kTrack) m.in_face = select(w < m.in, I::set(f), m.in_face);
@@ -70,7 +70,7 @@ struct Octahedron : Polyhedron<RealType, W, kRays> {
   // Accumulates the gradients of the entry and exit planes (0 in lanes without a hit) in the sums of the three local
   // forms p_k: with g the gradient to p_k, the sums of g, g x, g y and g w at 0, 3, 6 and 9. px and py are positions
   // relative to the pair's origin.
-  static void add_planes(const Record& r, const Meeting& m, M hit, V g_in, V g_out, V px, V py, V* sums) {
+  static void add_planes(const Record& r, const Intersection& m, M hit, V g_in, V g_out, V px, V py, V* sums) {
     // A lane without a hit may hold an infinity, and 0 times infinity is NaN.
     const V zero = V::set(0), g_in_w = g_in * select(hit, m.in, zero), g_out_w = g_out * select(hit, m.out, zero);
     for (int k = 0; k < 3; ++k) {

@@ -2,8 +2,8 @@
 // and the backward pass.
 //
 // A tile kernel needs from a primitive kind ("Kind"):
-//   Record, Meeting, kVolume (absorbs along an interval), kColorSums and kGeometrySums per gradient slot
-//   meet          which lanes hit, and the intersection data that the functions below need
+//   Record, Intersection, kVolume (absorbs along an interval), kColorSums and kGeometrySums per gradient slot
+//   intersect     which lanes hit, and the intersection data that the functions below need
 //   thickness     the absorbed amount, in the form that `attenuate` expects (0 in lanes without a hit)
 //   attenuate     thickness to alpha and transmittance
 //   depths        z-depths of entry and exit
@@ -38,7 +38,7 @@ struct Polyhedron {
   static constexpr RayModel kRayModel = kRays;
   static constexpr int kColorSums = 16, kGeometrySums = 32;
 
-  struct Meeting {
+  struct Intersection {
     V in, out;               // planes of entry and exit, in < out is a miss
     I in_face, out_face;     // where tracked
     V w_in, w_out, inverse;  // exact rays: inverse depths and 1 / (w_in w_out)
@@ -46,7 +46,7 @@ struct Polyhedron {
   };
 
   template <class Record>
-  static V thickness(const Record& r, V length, M hit, Meeting& m) {
+  static V thickness(const Record& r, V length, M hit, Intersection& m) {
     if constexpr (kRays == RayModel::kExact) {
       m.w_in = m.in + V::set(r.w0), m.w_out = m.out + V::set(r.w0);
       m.inverse = rcp(m.w_in * m.w_out);
@@ -61,7 +61,7 @@ struct Polyhedron {
     exp_neg(tau, alpha, through);
   }
   template <class Record>
-  static void depths(const Record& r, V length, const Meeting& m, V& t_in, V& t_out) {
+  static void depths(const Record& r, V length, const Intersection& m, V& t_in, V& t_out) {
     if constexpr (kRays == RayModel::kExact) {
       t_in = m.w_out * m.inverse, t_out = m.w_in * m.inverse;
     } else {
@@ -73,7 +73,7 @@ struct Polyhedron {
   // in lanes without a hit), and the density's additional gradient besides its share of the thickness. The unnamed
   // argument is the transmittance. kDistance: there is a sum for the centre's distance.
   template <class Kind, bool kDistance>
-  static void add_gradient(const typename Kind::Record& r, const Meeting& m, M hit, V length, V, V d_tau, V d_in,
+  static void add_gradient(const typename Kind::Record& r, const Intersection& m, M hit, V length, V, V d_tau, V d_in,
                            V d_out, V d_density, V px, V py, V* sums) {
     const V zero = V::set(0), d_chord = d_tau * V::set(r.density);
     sums[Sum::density] = fma(d_tau, m.chord, sums[Sum::density] + d_density);

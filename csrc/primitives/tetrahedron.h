@@ -28,12 +28,12 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
   using V = typename Base::V;
   using M = typename Base::M;
   using I = typename Base::I;
-  using Meeting = typename Base::Meeting;
+  using Intersection = typename Base::Intersection;
 
   // Computes the planes where the rays enter and leave; x and y are in pixels relative to the record's reference.
   // kTrack: also which faces.
   template <bool kTrack>
-  static M meet(const Record& r, const View& view, V x, V y, V, Meeting& m) {
+  static M intersect(const Record& r, const View& view, V x, V y, V, Intersection& m) {
     constexpr bool kExact = kRays == RayModel::kExact;
     m.in = V::set(kExact ? Real(1 / view.near) - r.w0 : Real(kBeyond));
     m.out = V::set(kExact ? Real(kFarInverse) - r.w0 : Real(-kBeyond));
@@ -51,7 +51,7 @@ struct Tetrahedron : Polyhedron<RealType, W, kRays> {
 
   // Accumulates the gradients of the entry and exit planes (0 in lanes without a hit): with g the gradient to face f's
   // plane, the sums of g, g x and g y at f, 4 + f and 8 + f. px and py are positions relative to the pair's origin.
-  static void add_planes(const Record&, const Meeting& m, M, V g_in, V g_out, V px, V py, V* sums) {
+  static void add_planes(const Record&, const Intersection& m, M, V g_in, V g_out, V px, V py, V* sums) {
     const V zero = V::set(0);
     for (int f = 0; f < 4; ++f) {
       const V g = select(equal(m.in_face, f), g_in, select(equal(m.out_face, f), g_out, zero));

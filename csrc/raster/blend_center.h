@@ -167,9 +167,9 @@ Counts forward_center(const RasterParams<typename Kind::Real>& P, int tile, void
           for (int k = 0; k < kGroup && todo; ++k, todo &= todo - 1) {
             const int i = std::countr_zero(todo);
             const auto& R = *record[i];
-            typename Kind::Meeting m;
+            typename Kind::Intersection m;
             const M hit =
-                Kind::template meet<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+                Kind::template intersect<kGeometry>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
             taus[kept] = Kind::thickness(R, v_length, hit, m);
             if constexpr (kGeometry) Kind::depths(R, v_length, m, t_in[kept], t_out[kept]), in_face[kept] = m.in_face;
             hits[kept] = hit, entry[kept] = i;
@@ -283,7 +283,7 @@ struct Incoming {
 template <class Kind, bool kGeometry>
 inline void blend_backward(const typename Kind::Record& record, const typename Kind::Real (*normals)[3],
                            const View& view, Incoming<typename Kind::Real, Kind::kWidth, kGeometry>& state,
-                           const typename Kind::Meeting& m, Mask<typename Kind::Real, Kind::kWidth> met,
+                           const typename Kind::Intersection& m, Mask<typename Kind::Real, Kind::kWidth> met,
                            Vec<typename Kind::Real, Kind::kWidth> tau, int at,
                            Vec<typename Kind::Real, Kind::kWidth> px, Vec<typename Kind::Real, Kind::kWidth> py,
                            Vec<typename Kind::Real, Kind::kWidth>* sums) {
@@ -408,7 +408,7 @@ void backward_center(const RasterParams<typename Kind::Real>& P, int tile, void*
     for (V& s : sums) s = V::set(0);
     int part = 0;
     while (todo) {
-      typename Kind::Meeting ready[kReady];
+      typename Kind::Intersection ready[kReady];
       V taus[kReady];
       M met[kReady];
       int places[kReady], count = 0;
@@ -419,7 +419,7 @@ void backward_center(const RasterParams<typename Kind::Real>& P, int tile, void*
         const V py = lanes.y + V::set(Real(4 * (block >> 2) + T::part_y(part)) - origin_y);
         const int at = block * 16 + part * W;
         const V v_length = V::load(state.length + at);
-        met[count] = Kind::template meet<true>(record, view, px + from_x, py + from_y, v_length, ready[count]);
+        met[count] = Kind::template intersect<true>(record, view, px + from_x, py + from_y, v_length, ready[count]);
         taus[count] = Kind::thickness(record, v_length, met[count], ready[count]);
         places[count] = at;
         count += T::kParts == 1 || met[count].bits() != 0;

@@ -49,7 +49,7 @@ struct OverlapCandidate {
   using V = Vec<Real, Kind::kWidth>;
   const typename Kind::Record* record;
   uint32_t entry, pixels;
-  typename Kind::Meeting meeting;
+  typename Kind::Intersection intersection;
   V t_in, t_out;                               // both before every event if the ray misses
   V rate;                                      // density per unit of z-depth
   V weight;                                    // integral of T density over its interval so far
@@ -80,11 +80,12 @@ inline void sweep_overlaps(Window<Kind, Candidate>& window, const View& view,
     auto latest = [&] { return max_lane(select(next < never, next, before)); };
     while (window.more() && (window.bound() <= latest() || !(next < never).bits())) {
       Candidate& c = window.take();
-      const M hit = going & Kind::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
-                                                        part.y - V::set(c.record->ref_y), v_length, c.meeting);
-      Kind::thickness(*c.record, v_length, hit, c.meeting);
+      const M hit =
+          going & Kind::template intersect<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
+                                                   part.y - V::set(c.record->ref_y), v_length, c.intersection);
+      Kind::thickness(*c.record, v_length, hit, c.intersection);
       V t_in, t_out;
-      Kind::depths(*c.record, v_length, c.meeting, t_in, t_out);
+      Kind::depths(*c.record, v_length, c.intersection, t_in, t_out);
       // An interval that rounds to zero length is not a hit; depths never decrease along a ray.
       const M met = hit & (t_in < t_out) & (now < t_out);
       if (!met.bits()) {
@@ -161,7 +162,7 @@ Counts forward_overlap(const RasterParams<typename Kind::Real>& P, int tile, voi
               for (int k = 0; k < 3; ++k) emission[k] = fma(rate, V::set(c.record->rgb[k]), emission[k]);
               if constexpr (kGeometry)
                 for (int f = 0; f < 4; ++f) {
-                  const V share = select(equal(c.meeting.in_face, f), rate, zero);
+                  const V share = select(equal(c.intersection.in_face, f), rate, zero);
                   for (int k = 0; k < 3; ++k)
                     facing[k] = fma(share, V::set(P.normals[P.lists.primitive[c.entry]][f][k]), facing[k]);
                 }
@@ -274,9 +275,9 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
               for (int f = 0; f < 4; ++f) {
                 c.d_median[f] = zero;
                 for (int k = 0; k < 3; ++k)
-                  c.value = fma(
-                      select(equal(c.meeting.in_face, f), V::set(P.normals[P.lists.primitive[c.entry]][f][k]), zero),
-                      incoming(S::kNormal + k), c.value);
+                  c.value = fma(select(equal(c.intersection.in_face, f),
+                                       V::set(P.normals[P.lists.primitive[c.entry]][f][k]), zero),
+                                incoming(S::kNormal + k), c.value);
               }
           },
           [&] { return t >= v_stop; },
@@ -333,8 +334,8 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
                   V n = zero;
                   for (int f = 0; f < 4; ++f)
                     for (int k = 0; k < 3; ++k)
-                      n = fma(select(equal(c.meeting.in_face, f), V::set(P.normals[P.lists.primitive[c.entry]][f][k]),
-                                     zero),
+                      n = fma(select(equal(c.intersection.in_face, f),
+                                     V::set(P.normals[P.lists.primitive[c.entry]][f][k]), zero),
                               own[k], n);
                   return n;
                 };
@@ -348,7 +349,8 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
                   const M inside = crossing & (now >= c.t_in) & (now < c.t_out);
                   c.d_density = c.d_density + select(inside, (of(c) - turned) * slow, zero);
                   for (int f = 0; f < 4; ++f)
-                    c.d_median[f] = c.d_median[f] + select(inside & equal(c.meeting.in_face, f), c.rate * slow, zero);
+                    c.d_median[f] =
+                        c.d_median[f] + select(inside & equal(c.intersection.in_face, f), c.rate * slow, zero);
                 }
               }
               crossed = select(crossing, V::set(1), crossed);
@@ -379,11 +381,12 @@ void backward_overlap(const RasterParams<typename Kind::Real>& P, int tile, void
               for (int f = 0; f < 4; ++f)
                 for (int k = 0; k < 3; ++k)
                   sums[Sum::normal + 3 * f + k] =
-                      fma(select(equal(c.meeting.in_face, f), c.weight, zero), incoming(S::kNormal + k),
+                      fma(select(equal(c.intersection.in_face, f), c.weight, zero), incoming(S::kNormal + k),
                           c.d_median[f] * incoming(S::kMedianNormal + k));
             Kind::template add_gradient<Kind, kSums == Kind::kGeometrySums>(
-                *c.record, c.meeting, met, v_length, zero, zero, select(met, c.d_in, zero), select(met, c.d_out, zero),
-                select(met, c.d_density * v_length, zero), part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
+                *c.record, c.intersection, met, v_length, zero, zero, select(met, c.d_in, zero),
+                select(met, c.d_out, zero), select(met, c.d_density * v_length, zero),
+                part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
                 part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), sums);
             add_to_slot<Kind, kSums>(*c.record, sums, tile_x, tile_y, slot_of(c.entry));
           });

@@ -2,9 +2,9 @@
 // backward passes.
 //
 // A tile list is sorted by a lower bound of each primitive's depth (ProjectParams::key). For the W rays of a part of a
-// block, a window holds the primitives that some ray is currently meeting. The next primitive enters the window as soon
-// as a ray could meet it before its next event. Every ray advances from event to event by itself, but the loops run
-// over the window, which is the same for all rays, so no gather or scatter is needed.
+// block, a window holds the primitives that some ray is currently intersection. The next primitive enters the window as
+// soon as a ray could meet it before its next event. Every ray advances from event to event by itself, but the loops
+// run over the window, which is the same for all rays, so no gather or scatter is needed.
 #pragma once
 
 #include <limits>
@@ -103,7 +103,7 @@ struct EntryCandidate {
   using V = Vec<Real, Kind::kWidth>;
   const typename Kind::Record* record;
   uint32_t entry;
-  typename Kind::Meeting meeting;
+  typename Kind::Intersection intersection;
   Mask<Real, Kind::kWidth> waiting;  // hit, and not blended yet
   V tau, t_in, t_out;
   V sums[kBackward ? (kGeometry ? Kind::kGeometrySums : Kind::kColorSums) : 1];
@@ -128,14 +128,14 @@ inline void sweep_entries(Window<Kind, Candidate>& window, const View& view,
     auto latest = [&] { return max_lane(select(going & (next < never), next, V::set(-kNever<Real>))); };
     while (window.more() && (window.bound() <= latest() || !(going & (next < never)).bits())) {
       Candidate& c = window.take();
-      c.waiting = Kind::template meet<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
-                                              part.y - V::set(c.record->ref_y), v_length, c.meeting);
+      c.waiting = Kind::template intersect<kTrack>(*c.record, view, part.x - V::set(c.record->ref_x),
+                                                   part.y - V::set(c.record->ref_y), v_length, c.intersection);
       if (!(c.waiting & going).bits()) {
         window.drop_last();
         continue;
       }
-      c.tau = Kind::thickness(*c.record, v_length, c.waiting, c.meeting);
-      Kind::depths(*c.record, v_length, c.meeting, c.t_in, c.t_out);
+      c.tau = Kind::thickness(*c.record, v_length, c.waiting, c.intersection);
+      Kind::depths(*c.record, v_length, c.intersection, c.t_in, c.t_out);
       c.t_in = max(c.t_in, last);
       begin(c);
       next = min(next, select(c.waiting & going, c.t_in, never));
@@ -205,8 +205,8 @@ Counts forward_entry(const RasterParams<typename Kind::Real>& P, int tile, void*
             if constexpr (kGeometry) {
               const uint32_t slot = P.lists.slot[c.entry];
               P.pair_weight[slot] = std::max(P.pair_weight[slot], max_lane(weight)), P.pair_pixels[slot] += count;
-              blend_geometry<Kind>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.meeting.in_face, t, after,
-                                   c.tau, alpha, e_tau, weight, c.t_in, c.t_out, Real(view.level), geo, at);
+              blend_geometry<Kind>(R, P.normals[P.lists.primitive[c.entry]], v_length, hit, c.intersection.in_face, t,
+                                   after, c.tau, alpha, e_tau, weight, c.t_in, c.t_out, Real(view.level), geo, at);
             }
             t = select(hit, after, t);
           },
@@ -258,7 +258,7 @@ void backward_entry(const RasterParams<typename Kind::Real>& P, int tile, void* 
           [&] { return V::load(state.through + part.at) >= V::set(Real(view.stop)); },
           [&](Candidate& c, M now) {
             blend_backward<Kind, kGeometry>(*c.record, kGeometry ? P.normals[P.lists.primitive[c.entry]] : nullptr,
-                                            view, state, c.meeting, now, c.tau, part.at,
+                                            view, state, c.intersection, now, c.tau, part.at,
                                             part.px - V::set(origin_in_tile(c.record->ref_x, tile_x)),
                                             part.py - V::set(origin_in_tile(c.record->ref_y, tile_y)), c.sums);
           },

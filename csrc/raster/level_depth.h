@@ -38,16 +38,16 @@ void level_depth_tile(const RasterParams<typename Kind::Real>& P, int tile, type
       for (uint32_t e = P.lists.tile_begin[tile]; e < P.lists.tile_begin[tile + 1]; ++e) {
         if (!(P.lists.blocks[e] >> block & 1)) continue;
         const auto& record = static_cast<const typename Kind::Record*>(P.records)[P.lists.primitive[e]];
-        typename Kind::Meeting meeting;
+        typename Kind::Intersection intersection;
         const V v_length = V::load(length + at);
-        const M hit = Kind::template meet<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y),
-                                                 v_length, meeting);
+        const M hit = Kind::template intersect<false>(record, view, x - V::set(record.ref_x), y - V::set(record.ref_y),
+                                                      v_length, intersection);
         if (!hit.bits()) continue;
-        Kind::thickness(record, v_length, hit, meeting);
+        Kind::thickness(record, v_length, hit, intersection);
         V t_in, t_out;
-        Kind::depths(record, v_length, meeting, t_in, t_out);
+        Kind::depths(record, v_length, intersection, t_in, t_out);
         t_in = select(hit, t_in, zero);
-        const V thick = meeting.chord * rcp(v_length), rate = V::set(record.density) * v_length;
+        const V thick = intersection.chord * rcp(v_length), rate = V::set(record.density) * v_length;
         low = min(low, select(hit, t_in, low)), high = max(high, t_in + thick);
         Real* slot = scratch + int64_t(count++) * 3 * W;
         t_in.store(slot), thick.store(slot + W), rate.store(slot + 2 * W);

@@ -98,8 +98,9 @@ Limits measure_limits() {
         V taus[kGroup];
         for (int i = 0; i < kGroup; ++i) {
           const auto& R = records[first + i];
-          typename Kind::Meeting m;
-          const auto hit = Kind::template meet<false>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+          typename Kind::Intersection m;
+          const auto hit =
+              Kind::template intersect<false>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
           taus[i] = Kind::thickness(R, v_length, hit, m);
         }
         for (int i = 0; i < kGroup; ++i) {
@@ -131,9 +132,9 @@ Limits measure_limits() {
       for (V& s : sums) s = V::set(0);
       each_part([&](int at, V x, V y) {
         const auto& R = opaque(record_of_pair);
-        typename Kind::Meeting m;
+        typename Kind::Intersection m;
         const V v_length = V::load(state.length + at);
-        const auto hit = Kind::template meet<true>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
+        const auto hit = Kind::template intersect<true>(R, view, x - V::set(R.ref_x), y - V::set(R.ref_y), v_length, m);
         const V tau = Kind::thickness(R, v_length, hit, m);
         blend_backward<Kind, false>(R, nullptr, view, state, m, hit, tau, at, x, y, sums);
       });
