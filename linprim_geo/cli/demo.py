@@ -46,7 +46,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
 
     log(f"1/6 photographing the built-in part: {views} views of {pixels}x{pixels}")
     scene, run = root / "scene", root / "run"
-    synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere")
+    synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere", quiet=quiet)
     log("2/6 training")
     trained = train(
         scene,

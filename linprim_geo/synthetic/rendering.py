@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from linprim_geo.base.progress import Progress
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.raycast import RayCaster
 from linprim_geo.synthetic.camera_effects import CameraEffects
@@ -35,8 +36,11 @@ SHININESS = 12
 """Phong's exponent of the highlights, low enough for spherical harmonics of low degree to represent them."""
 
 
-def render_views(renderer: Renderer, train: list[Camera], test: list[Camera], workers: int) -> list[float]:
-    """Render all views to their files; return the share of pixels of each that show the surface."""
+def render_views(
+    renderer: Renderer, train: list[Camera], test: list[Camera], workers: int, *, quiet: bool = True
+) -> list[float]:
+    """Render all views to their files; return the share of pixels of each that show the surface. Prints progress to
+    stderr, unless `quiet`."""
     jobs = [("train", i, camera) for i, camera in enumerate(train)]
     jobs += [("test", i, camera) for i, camera in enumerate(test)]
     for split in {split for split, _, _ in jobs}:
@@ -45,8 +49,13 @@ def render_views(renderer: Renderer, train: list[Camera], test: list[Camera], wo
     if isinstance(renderer.backdrop, TracedScene):
         renderer.backdrop.prepare()
         workers = 1  # the path tracer itself uses all cores
+    progress, shares = Progress("rendered views", len(jobs), quiet=quiet), list[float]()
     with ThreadPoolExecutor(workers) as pool:
-        return list(pool.map(lambda job: renderer.write(*job), jobs))
+        for share in pool.map(lambda job: renderer.write(*job), jobs):
+            shares.append(share)
+            progress.update(len(shares))
+    progress.clear()
+    return shares
 
 
 class Renderer:

@@ -47,6 +47,7 @@ def synthesize(
     shape: str | None = None,
     mesh: str | os.PathLike | TexturedMesh | None = None,
     overwrite: bool = False,
+    quiet: bool = False,
     **changes: Any,
 ) -> dict:
     """Render a capture of a built-in scene or of a mesh to the folder `out`, with ground truth.
@@ -72,6 +73,7 @@ def synthesize(
         shape: `cad`, `smooth`, `room`, `wires` or `hall`. Give `shape` or `mesh`, not both; the default is `cad`.
         mesh: a mesh file with texture or vertex colours, or a `TexturedMesh`.
         overwrite: replace `out` if it was made by `synth` before.
+        quiet: print no progress to stderr.
         changes: fields of `options` by name, such as `views=16`.
 
     Returns:
@@ -87,7 +89,7 @@ def synthesize(
     plan = _plan(shape, mesh, options)
     temporary = prepare_folder(out, overwrite)
     try:
-        report = _write_capture(plan, options, temporary)
+        report = _write_capture(plan, options, temporary, quiet)
         report = {"output": str(out), **report}
         write_json(temporary / "synth.json", report)
         publish_folder(temporary, out)
@@ -140,13 +142,13 @@ def _plan(shape, mesh, options: SynthOptions) -> _Plan:
     return _Plan(surface, caster, backdrop, path, fov, train, test, distance, gains, workers)
 
 
-def _write_capture(plan: _Plan, options: SynthOptions, folder: Path) -> dict:
+def _write_capture(plan: _Plan, options: SynthOptions, folder: Path, quiet: bool) -> dict:
     """Write all files of the capture except `synth.json`, and return the entries of that."""
     surface, caster, train, test = plan.surface, plan.caster, plan.train, plan.test
     unit = depth_unit(surface, train + test) if options.depth_format == "png" else 1.0
     single = without_threads(caster)
     renderer = Renderer(surface, single, options, plan.backdrop, unit, folder, plan.gains)
-    covered = render_views(renderer, train, test, plan.workers)
+    covered = render_views(renderer, train, test, plan.workers, quiet=quiet)
     told = _told(plan, options)
     cloud = _cloud(plan, options, renderer, told["train"], folder)
     write_colmap(folder / "sparse" / "0", told["train"], cloud, options.distortion, options.jpeg)

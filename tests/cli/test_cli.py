@@ -301,17 +301,17 @@ def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
     )
     monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
     room = "synth out --scene room --size 64x48 --fov 60 --background 0,0.5,1 --overwrite"
-    for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01"):
+    for line in ("synth out", room, "synth out --mesh x.glb --size 64 --point-noise 0.01 --quiet"):
         assert cli.main(line.split()) == 0
-    nothing = {"shape": None, "mesh": None, "overwrite": False}
+    nothing = {"shape": None, "mesh": None, "overwrite": False, "quiet": False}
     assert calls == [
         ("out", SynthOptions(), nothing),
         (
             "out",
             SynthOptions(size=(64, 48), fov=60.0, background="0,0.5,1"),
-            {"shape": "room", "mesh": None, "overwrite": True},
+            nothing | {"shape": "room", "overwrite": True},
         ),
-        ("out", SynthOptions(size=(64, 64), point_noise=0.01), nothing | {"mesh": "x.glb"}),
+        ("out", SynthOptions(size=(64, 64), point_noise=0.01), nothing | {"mesh": "x.glb", "quiet": True}),
     ]
 
 

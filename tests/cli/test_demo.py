@@ -99,5 +99,5 @@ def test_quiet_reaches_every_stage(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("linprim_geo.runs.render.render_run", stage("render"))
     monkeypatch.setattr("linprim_geo.surface.extract.extract_mesh", stage("extract", last=True))
     assert cli.main(["demo", "-o", str(tmp_path / "d"), "--quiet"]) == 1
-    assert called == [("synth", None), ("train", True), ("render", True), ("extract", True)]
+    assert called == [("synth", True), ("train", True), ("render", True), ("extract", True)]
     assert capfd.readouterr().err == "linprim-geo: error: stopped\n"

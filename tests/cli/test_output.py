@@ -84,6 +84,7 @@ REPORTING = {
     "render RUN -o renders": "files",
     "extract-mesh RUN -o m.ply --voxel-size 0.1 --level 0.75": "faces",
     "stereo SCENE -o d --threads 1": "coverage",
+    "synth s --views 3 --test-views 1 --size 32 --points 50 --threads 1": "points",
     "tradeoff SCENE -o t --run RUN --parameters rays --quick --rounds 1 --threads 1": "sentences",
 }
 
@@ -116,7 +117,7 @@ def test_what_is_not_quiet_says_something(tiny_run, tmp_path, talkative, capfd):
 
 
 def test_quiet_is_an_option_where_something_is_reported():
-    takes = {"train", "inspect", "render", "extract-mesh", "stereo", "tradeoff", "demo"}
+    takes = {"train", "inspect", "render", "extract-mesh", "stereo", "synth", "tradeoff", "demo"}
     assert {line.split()[0] for line in REPORTING} == takes - {"demo"}
     (commands,) = (
         action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction)

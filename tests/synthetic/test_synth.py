@@ -1,11 +1,13 @@
 """Camera paths see what they are to see, and a synthetic capture agrees with its own surface in every file."""
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 from helpers.surfaces import areas
 
+from linprim_geo.base import progress
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.load import load_scene
 from linprim_geo.geometry.camera import Camera
@@ -119,6 +121,17 @@ def test_capture_has_all_files_and_the_report_says_what_was_made(capture):
     assert json.loads((out / "synth.json").read_text())["principal_point_offset"] == [5.0, -3.5]
     assert report["views"] == 8 and report["points"] == 400 and report["seconds"] > 0
     assert not [entry for entry in out.parent.iterdir() if entry.name.startswith(".")]
+
+
+def test_rendered_views_are_counted_on_stderr_unless_quiet(tmp_path, built, monkeypatch, capsys):
+    clock = itertools.count(0, 30)
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    small = SMALL | {"views": 2, "test_views": 1}
+    synthesize(tmp_path / "told", mesh=built["cad"], **small)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split()[:3] for line in lines] == [["rendered", "views", f"{done}/3"] for done in (1, 2, 3)]
+    synthesize(tmp_path / "quiet", mesh=built["cad"], quiet=True, **small)
+    assert capsys.readouterr().err == ""
 
 
 def test_depth_normals_and_masks_are_those_of_the_surface_at_pixel_centres(capture, built):

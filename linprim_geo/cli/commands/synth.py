@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from linprim_geo.cli.arguments import from_args
-from linprim_geo.cli.options import AddCommand, add_options
+from linprim_geo.cli.options import AddCommand, add_options, add_quiet
 from linprim_geo.cli.output import Output
 from linprim_geo.synthetic.options import SynthOptions
 
@@ -17,6 +17,7 @@ def add(command: AddCommand) -> None:
     shape.add_argument("--scene", choices=("cad", "smooth", "room", "wires", "hall"), help="built-in (default cad)")
     shape.add_argument("--mesh", metavar="FILE", help="any mesh with a texture or vertex colours")
     sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
+    add_quiet(sub)
     add_options(sub.add_argument_group("capture"), SynthOptions)
 
 
@@ -24,5 +25,13 @@ def run(parsed: argparse.Namespace) -> Output:
     from linprim_geo.synthetic.synth import synthesize
 
     options = from_args(SynthOptions, parsed)
-    made = synthesize(parsed.output, options, shape=parsed.scene, mesh=parsed.mesh, overwrite=parsed.overwrite)
-    return Output(made)
+    return Output(
+        synthesize(
+            parsed.output,
+            options,
+            shape=parsed.scene,
+            mesh=parsed.mesh,
+            overwrite=parsed.overwrite,
+            quiet=parsed.quiet,
+        )
+    )
