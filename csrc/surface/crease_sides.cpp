@@ -184,7 +184,7 @@ class Around {
   // Writes the planes of the sides of an edge's ends, whether the two sides meet at a crease, and the median length of
   // the edges around. Returns false if an end has no side, if the normals of a side are not even, or if the ends lie on
   // different sides that do not make a crease.
-  bool ask(const int64_t* ends, double* plane, uint8_t& crosses, double& length) {
+  bool test(const int64_t* ends, double* plane, uint8_t& crosses, double& length) {
     if (!gather(ends)) return false;
     measure();
     length = length_;
@@ -375,7 +375,7 @@ class Around {
 using Ends = std::array<int64_t, 2>;
 
 // Returns the edges of faces that are not flat, each once, sorted.
-std::vector<Ends> edges_to_ask(const Mesh& mesh) {
+std::vector<Ends> edges_to_test(const Mesh& mesh) {
   std::vector<Ends> edges;
   for (int64_t f = 0; f < mesh.fans.faces; ++f)
     for (int k = 0; k < 3 && !mesh.flat[f]; ++k) {
@@ -388,19 +388,19 @@ std::vector<Ends> edges_to_ask(const Mesh& mesh) {
 }
 
 // Results of the tests, one entry per edge; `known`: both ends lie on known sides.
-struct Answers {
+struct EdgeTests {
   std::vector<std::array<double, 8>> plane;
-  std::vector<uint8_t> known, crosses, asked;
+  std::vector<uint8_t> known, crosses, tested;
   std::vector<double> length;
 
-  explicit Answers(size_t count) : plane(count), known(count), crosses(count), asked(count), length(count) {}
+  explicit EdgeTests(size_t count) : plane(count), known(count), crosses(count), tested(count), length(count) {}
 };
 
 // Marks the vertices of all faces that touch an end of an edge across a crease.
-std::vector<uint8_t> beside_creases(const Mesh& mesh, const std::vector<Ends>& edges, const Answers& answers) {
+std::vector<uint8_t> beside_creases(const Mesh& mesh, const std::vector<Ends>& edges, const EdgeTests& tests) {
   std::vector<uint8_t> end(mesh.fans.vertices), beside(mesh.fans.vertices);
   for (size_t e = 0; e < edges.size(); ++e)
-    if (answers.known[e] && answers.crosses[e]) end[edges[e][0]] = end[edges[e][1]] = 1;
+    if (tests.known[e] && tests.crosses[e]) end[edges[e][0]] = end[edges[e][1]] = 1;
   for_rows(mesh.fans.vertices, [&](int64_t v) {
     beside[v] = end[v];
     mesh.beside.each(v, [&](int64_t other) { beside[v] |= end[other]; });
@@ -414,37 +414,37 @@ CreaseEdges crease_edges(const CreaseRules& how, int64_t vertices, int64_t faces
                          const double* vertex) {
   const FaceFans fans(vertices, faces, corner);
   const Mesh mesh = prepared(how, fans, vertex);
-  const std::vector<Ends> edges = edges_to_ask(mesh);
+  const std::vector<Ends> edges = edges_to_test(mesh);
   const int64_t count = int64_t(edges.size());
-  Answers answers(edges.size());
+  EdgeTests tests(edges.size());
   std::vector<std::unique_ptr<Around>> around(threads());
   // Tests the edges for which wanted(ends) is true and which were not tested before.
-  const auto ask_where = [&](const auto& wanted) {
+  const auto test_where = [&](const auto& wanted) {
     parallel_for((count + kEdgesPerTask - 1) / kEdgesPerTask, [&](int64_t task, int thread) {
       if (!around[thread]) around[thread] = std::make_unique<Around>(how, mesh);
       for (int64_t e = task * kEdgesPerTask; e < std::min((task + 1) * kEdgesPerTask, count); ++e) {
-        if (answers.asked[e] || !wanted(edges[e])) continue;
-        answers.asked[e] = 1;
-        answers.known[e] =
-            around[thread]->ask(edges[e].data(), answers.plane[e].data(), answers.crosses[e], answers.length[e]);
+        if (tests.tested[e] || !wanted(edges[e])) continue;
+        tests.tested[e] = 1;
+        tests.known[e] =
+            around[thread]->test(edges[e].data(), tests.plane[e].data(), tests.crosses[e], tests.length[e]);
       }
     });
   };
   const std::vector<Box> boxes = boxes_of_normals(how, mesh);
-  ask_where([&](const Ends& end) {
+  test_where([&](const Ends& end) {
     Box box = boxes[end[0]];
     box.take(boxes[end[1]]);
     return may_differ(how, box);
   });
-  const std::vector<uint8_t> beside = beside_creases(mesh, edges, answers);
-  ask_where([&](const Ends& end) { return beside[end[0]] || beside[end[1]]; });
+  const std::vector<uint8_t> beside = beside_creases(mesh, edges, tests);
+  test_where([&](const Ends& end) { return beside[end[0]] || beside[end[1]]; });
   CreaseEdges out;
   for (int64_t e = 0; e < count; ++e) {
-    if (!answers.known[e] || !(beside[edges[e][0]] || beside[edges[e][1]])) continue;
+    if (!tests.known[e] || !(beside[edges[e][0]] || beside[edges[e][1]])) continue;
     out.end.insert(out.end.end(), edges[e].begin(), edges[e].end());
-    out.plane.insert(out.plane.end(), answers.plane[e].begin(), answers.plane[e].end());
-    out.crosses.push_back(answers.crosses[e]);
-    out.length.push_back(answers.length[e]);
+    out.plane.insert(out.plane.end(), tests.plane[e].begin(), tests.plane[e].end());
+    out.crosses.push_back(tests.crosses[e]);
+    out.length.push_back(tests.length[e]);
   }
   return out;
 }
