@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import types
 
 import numpy as np
 import pytest
@@ -124,10 +125,9 @@ def test_capture_has_all_files_and_the_report_says_what_was_made(capture):
 
 
 def test_rendered_views_are_counted_on_stderr_unless_quiet(tmp_path, built, monkeypatch, capsys):
-    clock = itertools.count(0, 30)
-    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=itertools.count(0, 30).__next__))
     small = SMALL | {"views": 2, "test_views": 1}
-    synthesize(tmp_path / "told", mesh=built["cad"], **small)
+    synthesize(tmp_path / "shown", mesh=built["cad"], **small)
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[:3] for line in lines] == [["rendered", "views", f"{done}/3"] for done in (1, 2, 3)]
     synthesize(tmp_path / "quiet", mesh=built["cad"], quiet=True, **small)

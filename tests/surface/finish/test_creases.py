@@ -93,8 +93,8 @@ def test_edges_and_corners_of_a_block_are_where_they_belong():
     )
 
 
-def test_only_edges_across_creases_and_beside_such_ones_are_told():
-    # Noise makes faces that are not flat all over the block, and edges that are asked.
+def test_only_edges_across_creases_and_beside_such_ones_are_returned():
+    # Noise makes faces that are not flat all over the block, and edges that are tested.
     mesh = rough(voxels(box(*BLOCK)), 0.1)
     faces = np.ascontiguousarray(mesh.faces, np.int64)
     ends, _, crosses, _ = surface_ops.crease_edges(faces, np.array(mesh.vertices, np.float64), RULES)
