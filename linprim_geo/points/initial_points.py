@@ -91,7 +91,7 @@ def scene_normalization(scene: Scene) -> Similarity:
     Raises:
         LinprimError: all cameras are in one place and there are no points.
     """
-    target, distance = scene_centre(scene)
+    target, distance = scene_center_and_distance(scene)
     size = max(np.abs(view.camera.center).max() for view in scene.train)
     if not distance > _SAME_PLACE * size:
         raise LinprimError(
@@ -101,7 +101,7 @@ def scene_normalization(scene: Scene) -> Similarity:
     return Similarity(CAMERA_DISTANCE / distance, (x, y, z))
 
 
-def scene_centre(scene: Scene) -> tuple[np.ndarray, float]:
+def scene_center_and_distance(scene: Scene) -> tuple[np.ndarray, float]:
     """Return the (3,) centre of what the training cameras look at, and their median distance to it, in the data set's
     frame."""
     cameras = [view.camera for view in scene.train]
@@ -220,7 +220,7 @@ def evenly_spread_views(views: Sequence[View], limit: int) -> list[SmallView]:
 def _hull_box(scene: Scene, small_views: Sequence[SmallView], rng: np.random.Generator) -> np.ndarray:
     """Return (2, 3) corners of a box around the visual hull, refined in several rounds."""
     cameras = [small_view.camera for small_view in small_views]
-    center, distance = scene_centre(scene)
+    center, distance = scene_center_and_distance(scene)
     half = max(np.linalg.norm(camera.center - center) for camera in cameras)
     half = max(half, distance)
     box = np.stack([center - half, center + half])

@@ -39,8 +39,8 @@ def compare_depths(camera: Camera, depth: np.ndarray, other: Camera, plane: np.n
     """Compare (H, W) depths of `camera` with the view `other`, whose `plane` (3, H', W') holds inverse depths and their
     slopes."""
     pixel = np.full(depth.shape, -1, np.int32)
-    infinite, parallax = (np.full(depth.shape, value, np.float32) for value in (np.inf, 0))
-    reprojection_error, depth_difference = infinite, infinite.copy()
+    reprojection_error, parallax = np.full(depth.shape, np.inf, np.float32), np.zeros(depth.shape, np.float32)
+    depth_difference = reprojection_error.copy()
     rows, columns = np.nonzero(np.isfinite(depth) & (depth > 0))
     own = depth[rows, columns].astype(np.float64)
     pose = other.world_to_camera @ camera.camera_to_world

@@ -18,8 +18,9 @@ from linprim_geo.stereo.planes.shading import BOX, Fit, ShadedRegion, Shading, e
 
 # The most boxes of a region that are compared.
 MOST_BOXES = 800
-# A plane carries shading hardly worse than another if its residual is at most so many times as large.
-MOST_RESIDUAL_RATIO = 1.1
+# Two planes carry shading equally well if their residuals, or the numbers of boxes that they carry, differ by at most
+# this factor.
+EQUAL_RATIO = 1.1
 # The error of the plane of a single region, as a share of its distance.
 ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
 # Confirmed depths along the edges of regions constrain a plane if their residual, as a share of the depth, is below
@@ -27,10 +28,10 @@ ALIKE_DEPTH = 5 * CONFIRMED_DEPTH
 # TOLERANCE is taken as their standard deviation; as their errors are correlated, they count as at most INDEPENDENT
 # points.
 NEAR, NARROWER, HOLDING_STEPS, INDEPENDENT = 2 * TOLERANCE, 0.8, 6, 200
-# The largest residual of shading, as a multiple of the unconstrained plane's, of planes along the frame of a room:
-# lighting differs from the model, and nine in ten true walls of a room leave at most that much (DECISIONS 116); and of
-# planes moved to other right angles or to lines.
-FRAME_RESIDUAL_RATIO, MOVED_RESIDUAL_RATIO = 1.5, 1.03
+# The largest residual of shading, as a multiple of the unconstrained plane's, of a plane that other evidence supports,
+# such as the frame of a room or points along edges: lighting differs from the model, and nine in ten true walls of a
+# room leave at most that much (DECISIONS 116); and of planes moved to other right angles or to lines.
+SUPPORTED_RATIO, MOVED_RATIO = 1.5, 1.03
 
 
 class ConstrainedPlanes:
@@ -84,7 +85,7 @@ class ConstrainedPlanes:
                 continue
             framed = frame is not None and angles_to(frame, turned[[k], :3])[0] < RIGHT
             for plane in (self._shifted(turned[k], self.carried[k]), turned[k]):
-                if self._leaves_as_little(plane, few[k], fit, FRAME_RESIDUAL_RATIO if framed else MOVED_RESIDUAL_RATIO):
+                if self._leaves_as_little(plane, few[k], fit, SUPPORTED_RATIO if framed else MOVED_RATIO):
                     planes[k] = plane
                     break
         return planes
@@ -96,7 +97,7 @@ class ConstrainedPlanes:
         for k, plane in moved.items():
             few = [region.some(MOST_BOXES) for region in self.carried[k]]
             fit = evaluate(planes[k], few, self.shadings) if few else None
-            if fit is None or self._leaves_as_little(plane, few, fit, MOVED_RESIDUAL_RATIO):
+            if fit is None or self._leaves_as_little(plane, few, fit, MOVED_RATIO):
                 result[k] = plane
         return result
 
@@ -132,7 +133,7 @@ class ConstrainedPlanes:
             step = np.linalg.pinv(information, hermitian=True) @ (fit.downhill - weight * slope.T @ off[near])
             moved = fit.plane + step @ moves
             tried = evaluate(moved / np.linalg.norm(moved[:3]), few, self.shadings)
-            if tried is None or tried.left > MOST_RESIDUAL_RATIO * first.left or tried.boxes < 0.7 * first.boxes:
+            if tried is None or tried.left > EQUAL_RATIO * first.left or tried.boxes < 0.7 * first.boxes:
                 return plane
             fit = tried
         return fit.plane

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from linprim_geo.stereo.planes.constrained_planes import FRAME_RESIDUAL_RATIO, MOST_BOXES, MOST_RESIDUAL_RATIO
+from linprim_geo.stereo.planes.constrained_planes import EQUAL_RATIO, MOST_BOXES, SUPPORTED_RATIO
 from linprim_geo.stereo.planes.enclosing_planes import SURE_SHARE
 from linprim_geo.stereo.planes.plain_regions import TOLERANCE, in_camera
 from linprim_geo.stereo.planes.shading import ShadedRegion, Shading, evaluate
@@ -32,7 +32,7 @@ def best_first(carriers: dict[int, np.ndarray], carried: np.ndarray) -> list[int
     """Return the numbers of those `carriers` that carry about as many boxes of a region as any does, first the one with
     the highest `carried` (K,). `carriers` has (N,) bool of each plane: the boxes that it carries."""
     most = max(np.count_nonzero(boxes) for boxes in carriers.values())
-    as_well = [k for k, boxes in carriers.items() if MOST_RESIDUAL_RATIO * np.count_nonzero(boxes) >= most]
+    as_well = [k for k, boxes in carriers.items() if EQUAL_RATIO * np.count_nonzero(boxes) >= most]
     return sorted(as_well, key=lambda k: carried[k], reverse=True)
 
 
@@ -56,5 +56,5 @@ def preferred_by_edges(
     if (by_edges <= 0).any() or np.median(np.abs(by_edges / by_shading - 1)) < TOLERANCE:
         return area
     own, other = (evaluate(planes[number], few, shadings) for number in (area.number, other_number))
-    carries = own is not None and other is not None and other.left_share <= FRAME_RESIDUAL_RATIO * own.left_share
+    carries = own is not None and other is not None and other.left_share <= SUPPORTED_RATIO * own.left_share
     return replace(area, number=other_number) if carries else area

@@ -22,9 +22,9 @@ from linprim_geo.stereo.evidence import CONFIRMED_DEPTH
 from linprim_geo.stereo.planes.common_surfaces import SurfaceSupport
 from linprim_geo.stereo.planes.constrained_planes import (
     ALIKE_DEPTH,
-    FRAME_RESIDUAL_RATIO,
+    EQUAL_RATIO,
     MOST_BOXES,
-    MOST_RESIDUAL_RATIO,
+    SUPPORTED_RATIO,
     ConstrainedPlanes,
 )
 from linprim_geo.stereo.planes.enclosing_planes import AGREEING, SURE_SHARE
@@ -65,8 +65,8 @@ MOST_VIEWS, LEAST_VIEWS = 8, 3
 # Boxes of a region compared in the first steps from each start (later MOST_BOXES), and the number of these steps.
 FIRST_BOXES, FIRST_STEPS = 200, 6
 # A plane carries a region's shading if its residual is at most the share MOST_RESIDUAL_SHARE of the region's deviation;
-# a plane of other regions if at most OTHERS_SHARE and MOST_RESIDUAL_RATIO times that of the region's own plane, or
-# FRAME_RESIDUAL_RATIO times where it is near that one: glossy paint causes as much.
+# a plane of other regions if at most OTHERS_SHARE and EQUAL_RATIO times that of the region's own plane, or
+# SUPPORTED_RATIO times where it is near that one: glossy paint causes as much.
 MOST_RESIDUAL_SHARE, OTHERS_SHARE = 0.2, 0.25
 # Noise leaves a smoothed residual of one deviation; more shows another surface. At least FLAT_SHARE of a flat region is
 # below MOST_LEFT: tone curves and vignetting leave more at its ends (DECISIONS 57).
@@ -172,13 +172,13 @@ class ShadedPlanes:
             return None
         left = unexplained(region, in_camera(camera, fit.plane[None])[0], self.shadings)
         flat = np.count_nonzero(left <= MOST_LEFT) >= FLAT_SHARE * np.isfinite(left).sum()
-        most = min(MOST_RESIDUAL_RATIO * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
+        most = min(EQUAL_RATIO * fit.left_share, OTHERS_SHARE) if flat else OTHERS_SHARE
         return FittedRegion(region, most, fit if flat and self._certain(region, fit) else None)
 
     def _is_far(self, region: ShadedRegion, fit: Fit) -> bool:
         """Return whether a plane without parallax carries a region's shading as well as the fit: a sky."""
         far = self._far(region.some(MOST_BOXES))
-        return far is not None and far.left < MOST_RESIDUAL_RATIO * fit.left
+        return far is not None and far.left < EQUAL_RATIO * fit.left
 
     def _far(self, region: ShadedRegion, least: int = LEAST_VIEWS) -> Fit | None:
         """Evaluate a plane at infinity on the shading of a region; None if too few views show it."""
@@ -195,7 +195,7 @@ class ShadedPlanes:
             if far is None or far.left_share > MOST_RESIDUAL_SHARE:
                 continue
             fits = (evaluate(plane, [few], self.shadings) for plane in self.planes[self.by_points :])
-            if all(fit is None or fit.left_share > MOST_RESIDUAL_RATIO * far.left_share for fit in fits):
+            if all(fit is None or fit.left_share > EQUAL_RATIO * far.left_share for fit in fits):
                 self._mark(background, region)
         return background
 
@@ -208,7 +208,7 @@ class ShadedPlanes:
                 continue
             few = region.some(FIRST_BOXES)
             far = self._far(self._in_all_views(few), least=1)
-            most = 0.0 if far is None else min(MOST_RESIDUAL_SHARE, far.left_share / FRAME_RESIDUAL_RATIO)
+            most = 0.0 if far is None else min(MOST_RESIDUAL_SHARE, far.left_share / SUPPORTED_RATIO)
             if most > 0 and any(fit.left_share < most for fit in self._fits(few)):
                 self._mark(wall, region)
         return wall
@@ -311,7 +311,7 @@ class ShadedPlanes:
         found, own = evaluate(plane, [one.region.some(MOST_BOXES)], self.shadings), one.fit
         if found is None or own is None:
             return False
-        return found.boxes > 0.7 * own.boxes and found.left < MOST_RESIDUAL_RATIO * own.left
+        return found.boxes > 0.7 * own.boxes and found.left < EQUAL_RATIO * own.left
 
     def _carriers(self, one: FittedRegion) -> dict[int, np.ndarray]:
         """Return the planes that carry a region's shading, each with (N,) bool: around which of its boxes."""
@@ -335,7 +335,7 @@ class ShadedPlanes:
             return one.most_left
         own = one.region.rays @ in_camera(self._camera(one.region), one.fit.plane[None])[0]
         near = np.median(np.abs(inverse / own - 1)) < ALIKE_DEPTH
-        return min(FRAME_RESIDUAL_RATIO * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
+        return min(SUPPORTED_RATIO * one.fit.left_share, OTHERS_SHARE) if near else one.most_left
 
     def _all_carriers(self) -> list[list[dict[int, np.ndarray]]]:
         """Return `_carriers` of the regions of each view."""
@@ -424,7 +424,7 @@ class ShadedPlanes:
             for of_region in own:
                 for k, boxes in of_region.items():
                     carried[k] += np.count_nonzero(boxes)
-        carried[: self.given_count] *= MOST_RESIDUAL_RATIO
+        carried[: self.given_count] *= EQUAL_RATIO
         return [
             [
                 [self._area(one.region, boxes[k], k) for k in best_first(boxes, carried)]

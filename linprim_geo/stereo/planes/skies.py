@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from linprim_geo.stereo.depth_maps import SURE, DepthMap
-from linprim_geo.stereo.planes.constrained_planes import MOST_RESIDUAL_RATIO
+from linprim_geo.stereo.planes.constrained_planes import EQUAL_RATIO
 from linprim_geo.stereo.planes.plain_regions import common_planes, in_world, regions_of_views
 from linprim_geo.stereo.planes.point_planes import planes_of_points
 from linprim_geo.stereo.planes.shaded_planes import (
@@ -76,4 +76,4 @@ def _is_sky(region: ShadedRegion, known: np.ndarray, planes: np.ndarray, shading
     starts += [np.array([0, 0, 1 / (times * depth)]) for times in STARTS]
     fits = [in_views(fit_plane(in_world(shading.camera, start), [region], shadings)) for start in starts]
     fits += [evaluate(plane, [region], shadings) for plane in planes]
-    return all(fit.left_share > MOST_RESIDUAL_RATIO * far.left_share for fit in fits if fit is not None)
+    return all(fit.left_share > EQUAL_RATIO * far.left_share for fit in fits if fit is not None)

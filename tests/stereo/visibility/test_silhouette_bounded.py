@@ -10,7 +10,7 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.geometry.camera import Camera
-from linprim_geo.stereo.visibility import silhouette_bounded as outlined_things_module
+from linprim_geo.stereo.visibility import silhouette_bounded as module
 from linprim_geo.stereo.visibility.silhouette_bounded import between_silhouettes, silhouette_bounded
 from linprim_geo.stereo.visibility.thin_things import RenderedView
 
@@ -135,7 +135,7 @@ def test_cubes_are_those_of_a_grid():
     """Against sets of cells; points that are very far away are in none, and nothing overflows."""
     rng = np.random.default_rng(3)
     inside, others = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
-    cubes = outlined_things_module._Cubes(np.vstack([inside, [[1e30, 0, -1e30]]]), 0.3)
+    cubes = module._Cubes(np.vstack([inside, [[1e30, 0, -1e30]]]), 0.3)
     cells = [{tuple(cell) for cell in np.floor(points / 0.3)} for points in (inside, others)]
     number = cubes.of(others)
     np.testing.assert_array_equal(number >= 0, [tuple(cell) in cells[0] for cell in np.floor(others / 0.3)])
