@@ -27,7 +27,7 @@ def given_options(options: type, parsed: argparse.Namespace) -> list[str]:
 
 
 def effects_choice(parsed: argparse.Namespace):
-    """Return the choice of effects on the command line; by default none for a resumed run, whose effects are chosen."""
+    """Return the choice of effects on the command line; the default is none for a resumed run, which keeps its own."""
     from linprim_geo.base.options import SceneOptions, TrainOptions
     from linprim_geo.training.effects import Choice, parse_asked
 

@@ -6,7 +6,7 @@ import argparse
 
 from linprim_geo.base.errors import LinprimError
 
-# Placeholders in the help for arguments that are files, and for folders.
+# Metavars of arguments that are completed as files, and as folders.
 FILES = ("SCENE", "RUN", "MESH", "REFERENCE", "FILE", "IN", "OUT", "PLANE")
 FOLDERS = ("DIR",)
 

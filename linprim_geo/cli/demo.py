@@ -1,4 +1,4 @@
-"""The demo: a built-in part with ribs, holes and sharp edges is photographed, trained, meshed and scored."""
+"""The demo: renders photographs of a built-in part with ribs, holes and sharp edges, trains, meshes and scores it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
         if not quiet:
             print(text, file=sys.stderr)
 
-    log(f"1/6 photographing the built-in part: {views} views of {pixels}x{pixels}")
+    log(f"1/6 rendering photographs of the built-in part: {views} views of {pixels}x{pixels} pixels")
     scene, run = root / "scene", root / "run"
     synthesize(scene, shape="cad", views=views, test_views=12, size=pixels, path="sphere", quiet=quiet)
     log("2/6 training")
@@ -59,7 +59,7 @@ def run_demo(output: str = "runs/demo", size: str = "normal", *, quiet: bool = F
     render_run(run, quiet=True)
     log("4/6 extracting the surface")
     stats = extract_mesh(run, options=ExtractOptions(), quiet=quiet)
-    log("5/6 scoring against the exact mesh")
+    log("5/6 scoring against the exact reference mesh")
     reference = scene / "reference.ply"
     images = eval_images_run(run)
     depth = eval_depth_run(run, reference)
@@ -90,10 +90,10 @@ def describe(result: dict) -> str:
     """Return the result of `run_demo` as readable text."""
     return (
         f"\nPSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.4f} on {result['views']} held-out views; "
-        f"depth AbsRel {result['abs_rel']:.4f}, normals {result['normal_mean_deg']:.1f} degrees off\n"
+        f"depth AbsRel {result['abs_rel']:.4f}, mean normal error {result['normal_mean_deg']:.1f} degrees\n"
         f"mesh: Chamfer {result['chamfer_percent_diagonal']:.3f} % of the diagonal, F1 {result['f1']:.3f} at 1 %; "
         f"{result['primitives']} primitives, {result['seconds']:.0f} s of training\n\n"
-        f"all of it on one page: {result['report']}\n"
-        f"open {result['mesh']} and {result['reference']} in MeshLab; pictures are in {result['renders']}, "
-        f"figures in {Path(result['run']) / 'eval'}"
+        f"report: {result['report']}\n"
+        f"open {result['mesh']} and {result['reference']} in MeshLab; rendered images are in {result['renders']}, "
+        f"scores in {Path(result['run']) / 'eval'}"
     )

@@ -116,14 +116,14 @@ def describe(report: dict) -> str:
         f"libraries: {', '.join(libraries)}",
     ]
     if report["problems"]:
-        lines += ["what to do:", *(f"  * {problem}" for problem in report["problems"])]
+        lines += ["problems:", *(f"  * {problem}" for problem in report["problems"])]
     else:
-        lines.append("everything is there")
+        lines.append("no problems found")
     return "\n".join(lines)
 
 
 def _limits(report: dict) -> list[str]:
-    """Return lines on the machine's resources of which this process may use only a part, with the cause."""
+    """Return a line for each limit on the cores or memory that this process may use, and one for a container."""
     lines = [] if report["container"] is None else [f"container: {report['container']}"]
     if report["core_quota"] is not None:
         lines.append(f"quota: {report['core_quota']:g} of the machine's {report['machine_cores']} cores")

@@ -1,8 +1,8 @@
 """The command `linprim-geo`: its commands, and the reporting of results and failures.
 
-Only the standard library is imported here, the rest when a command runs, so that `--help` is immediate.
-Exit status: 0 success, 1 unusable input, 2 wrong arguments, 70 an error in this program, 130 interrupted, 141 the
-reader of the output has closed it.
+Only the standard library is imported here. Other libraries are imported when a command runs, so that `--help` is fast.
+Exit status: 0 success, 1 unusable input, 2 wrong arguments, 70 internal error, 130 interrupted, 141 broken pipe (the
+reader of stdout has closed it).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ COMMANDS = "train inspect render extract stereo evaluate show tradeoff synth con
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line and return its exit status; argparse itself exits with 0 (--help) or 2."""
-    # NumPy's matrices are small here, and OpenBLAS's threads wait for each other in busy loops, which multiplies the
-    # work on a busy machine.
+    # Matrices are small here. OpenBLAS's threads wait for each other in busy loops, which wastes time on a loaded
+    # machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # --json and --debug are allowed before and after the subcommand, so neither parser may set a default for them.
     parsed, unknown = build_parser().parse_known_args(arguments)
@@ -85,7 +85,7 @@ def explain(error: BaseException) -> tuple[str, int]:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose error message is one sentence, with a suggestion of what may have been meant."""
+    """A parser whose error message is one sentence; it suggests the closest valid word if there is one."""
 
     def error(self, message: str) -> NoReturn:
         if found := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)", message):
@@ -108,13 +108,13 @@ def build_parser() -> argparse.ArgumentParser:
     common = Parser(add_help=False)
     group = common.add_argument_group("output")
     hidden = argparse.SUPPRESS
-    group.add_argument("--json", action="store_true", default=hidden, help="print one JSON object and nothing else")
-    group.add_argument("--debug", action="store_true", default=hidden, help="show the traceback of an error")
+    group.add_argument("--json", action="store_true", default=hidden, help="print the result as one JSON object")
+    group.add_argument("--debug", action="store_true", default=hidden, help="print the traceback if an error occurs")
 
     parser = Parser(
         prog="linprim-geo",
-        description="From posed photographs to a scored mesh, through transparent polyhedra, on a CPU.",
-        epilog="linprim-geo COMMAND --help explains a command.",
+        description="Reconstruct a triangle mesh from photographs on the CPU, by training transparent polyhedra.",
+        epilog="Use linprim-geo COMMAND --help for the options of a command.",
         parents=[common],
         allow_abbrev=False,
     )

@@ -62,14 +62,15 @@ def _type_of(kind: type, word: str | None, parse: Callable[[str], Any] | None) -
 
 
 def add_effects(parser: argparse.ArgumentParser) -> None:
-    """Add --effects and --effect, which choose options that were not given."""
+    """Add --effects and --effect, which set options that are not given explicitly."""
     group = parser.add_argument_group("effects")
     text = (
-        "auto: what the data call for (default); none: the options as they are; all: everything on. An option that "
-        "is given stays"
+        "auto: switch effects on by evidence in the photographs, cameras and points (default of a new run); none: use "
+        "the options as they are; all: switch on every effect that the scene allows. Options that are given explicitly "
+        "are never changed"
     )
     group.add_argument("--effects", choices=("auto", "none", "all"), help=text)
-    text = "decide about one by hand, such as exposure=on; may be repeated; linprim-geo inspect SCENE names them"
+    text = "switch one effect on or off, e.g. exposure=on; may be repeated. linprim-geo inspect SCENE lists the effects"
     group.add_argument("--effect", action="append", default=[], metavar="NAME=on|off", help=text)
 
 
@@ -77,40 +78,43 @@ def add_workers(parser: argparse.ArgumentParser, workers: int | None = 0) -> arg
     """Add --cluster and --workers (with the default `workers`), which set where the parts of a job run."""
     group = parser.add_argument_group("workers")
     text = (
-        "local: Ray on this machine; an address such as 10.0.0.1:6379: the Ray cluster there, whose machines "
-        "all see the folders (default: processes of this machine); needs pip install 'linprim-geo[cluster]'"
+        "run tasks on Ray: local starts Ray on this machine, an address such as 10.0.0.1:6379 joins the cluster there, "
+        "whose machines must all see the same folders (default: worker processes on this machine). Needs pip install "
+        "'linprim-geo[cluster]'"
     )
     group.add_argument("--cluster", metavar="local|ADDRESS", help=text)
-    text = "at once at most; 0: one per core" + (" (default 0)" if workers == 0 else "")
+    text = "largest number of workers at a time; 0: one per core" + (" (default 0)" if workers == 0 else "")
     group.add_argument("--workers", type=whole, default=workers, metavar="N", help=text)
     return group
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
     """Add --quiet."""
-    parser.add_argument("--quiet", action="store_true", help="no progress")
+    parser.add_argument("--quiet", action="store_true", help="print no progress messages")
 
 
 def add_threads(parser: argparse.ArgumentParser) -> None:
     """Add --threads to a command whose options have none; `cli.main` applies it."""
-    text = "worker threads; 0 uses every core; the result does not depend on it (default 0)"
+    text = "number of threads; 0: one per core. The result does not depend on it (default 0)"
     parser.add_argument("--threads", dest="most_threads", type=threads, default=0, metavar="N", help=text)
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Add the argument for the folder of a run."""
-    parser.add_argument("run", metavar="RUN", help="folder that train has made")
+    parser.add_argument("run", metavar="RUN", help="run folder written by train")
 
 
 def add_scene(parser: argparse.ArgumentParser, **settings: Any) -> None:
     """Add the argument for the capture, a folder or a video."""
-    text = "folder of a capture, of plain photographs, or a video"
+    text = "capture to read: a folder of photographs with or without camera poses, or a video file"
     parser.add_argument("scene", metavar="SCENE", help=text, **settings)
 
 
 def add_split(parser: argparse.ArgumentParser) -> None:
     """Add --split."""
-    parser.add_argument("--split", choices=SPLITS, default="test", help="which views (default test)")
+    parser.add_argument(
+        "--split", choices=SPLITS, default="test", help="training views, held-out views (test), or all (default test)"
+    )
 
 
 def blocks(text: str) -> int | str:

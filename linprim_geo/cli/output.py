@@ -1,4 +1,4 @@
-"""The result of a command, and its printing."""
+"""The result of a command and how it is printed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Output:
-    """The result, which --json prints; the text for people, or None for one line per plain value; the exit status."""
+    """What a command returns: `result`, which --json prints; `text`, which is printed otherwise (None: one line per
+    number, text or bool of the result); and the exit `status`."""
 
     result: dict
     text: str | None = None

@@ -1,4 +1,4 @@
-"""The command convert, for files of primitives and meshes."""
+"""The command convert: between file formats of primitives and of meshes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    text = "convert primitives (npz, LinPrim's and 3DGS's ply) and meshes (ply, obj, glb, stl)"
+    text = "convert files of primitives (.npz, .ply of LinPrim or 3DGS) and of meshes (.ply, .obj, .glb, .stl)"
     sub = command("convert", run, text)
-    sub.add_argument("source", metavar="IN", help="run folder, .npz, .ply, .obj, .glb or .stl")
-    sub.add_argument("target", metavar="OUT", help="file to write; its suffix says the format")
+    sub.add_argument("source", metavar="IN", help="file to read (.npz, .ply, .obj, .glb, .stl), or a run folder")
+    sub.add_argument("target", metavar="OUT", help="file to write; the suffix selects the format")
     text = (
-        "what a .ply of primitives holds: their properties (default), triangles for MeshLab, or Gaussians "
-        "like octahedra"
+        "how primitives are written to .ply: primitives: in the layout of their kind; mesh: as triangles, for example "
+        "for MeshLab; gaussians: octahedra as Gaussians, for 3DGS viewers (default auto: primitives)"
     )
     choices = ("auto", "primitives", "mesh", "gaussians")
     sub.add_argument("--as", dest="write_as", choices=choices, default="auto", help=text)

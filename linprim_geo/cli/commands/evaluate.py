@@ -12,38 +12,41 @@ from linprim_geo.eval.options import ScoreOptions
 
 
 def add(command: AddCommand) -> None:
-    sub = command("eval-depth", eval_depth, "score a run's depth and normals against a mesh or the data set's depth")
+    sub = command("eval-depth", eval_depth, "score depth and normals of a run against a reference")
     add_run(sub)
-    sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame (default: its depth images)")
+    sub.add_argument(
+        "--reference", metavar="MESH", help="reference mesh in the data set's frame (default: its depth maps)"
+    )
     add_split(sub)
     text = (
-        "which depth: at half transmittance by exact overlap (default), or in the order of blending, the "
-        "mean, the first surface"
+        "depth to score. overlap: where transmittance falls to 1/2, overlapping primitives counted exactly (default); "
+        "median: the same in the run's order of blending; expected: the mean depth; first: the entry into the first "
+        "primitive"
     )
     sub.add_argument("--depth", choices=("overlap", "median", "expected", "first"), default="overlap", help=text)
-    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/eval/depth)")
+    sub.add_argument("-o", "--output", metavar="DIR", help="output folder (default RUN/eval/depth)")
     add_threads(sub)
 
-    sub = command("eval-images", eval_images, "score a run's colours: PSNR, SSIM and LPIPS on held-out views")
+    sub = command("eval-images", eval_images, "score renders of a run against photographs: PSNR, SSIM, LPIPS")
     add_run(sub)
     add_split(sub)
-    text = "folder to write to (default RUN/eval/images, or RUN/eval/mesh_images of a mesh)"
+    text = "output folder (default RUN/eval/images; RUN/eval/mesh_images with --mesh)"
     sub.add_argument("-o", "--output", metavar="DIR", help=text)
-    text = "score this mesh as the cameras see it, in its texture or colours, in place of the primitives"
+    text = "render and score this mesh, with its texture or vertex colours, in place of the primitives"
     sub.add_argument("--mesh", metavar="MESH", help=text)
     text = (
-        "weights of LPIPS, file or folder (default: torch's cache, and packages lpips or torchmetrics; none: "
-        "leaves it out)"
+        "file or folder with the weights of LPIPS; none: skip LPIPS (default: search torch's cache and the packages "
+        "lpips and torchmetrics)"
     )
     sub.add_argument("--lpips-weights", metavar="PATH", help=text)
     add_threads(sub)
 
-    sub = command("eval-mesh", eval_mesh, "score a mesh against a reference mesh: Chamfer distance and the rest")
+    sub = command("eval-mesh", eval_mesh, "score a mesh against a reference mesh: Chamfer, F1, normals, creases")
     sub.add_argument("mesh", metavar="MESH", help="mesh to score")
-    text = "mesh taken as the truth (dtu, tnt: or a scan's points as PLY)"
+    text = "ground-truth mesh; with --protocol dtu or tnt also a scan (points in a PLY file)"
     sub.add_argument("reference", metavar="REFERENCE", help=text)
-    sub.add_argument("--run", metavar="RUN", help="cull to what the training cameras of this run see")
-    text = "folder for results.json, error-coloured PLYs and plots (default RUN/eval/mesh)"
+    sub.add_argument("--run", metavar="RUN", help="run whose training cameras define the visible part")
+    text = "folder for results.json, error-coloured PLY files and plots (default RUN/eval/mesh; nothing without --run)"
     sub.add_argument("-o", "--output", metavar="DIR", help=text)
     add_threads(sub)
     add_options(sub.add_argument_group("scores"), ScoreOptions)

@@ -24,18 +24,27 @@ def add(command: AddCommand) -> None:
     sub = command("extract-mesh", run, "extract a triangle mesh from a run")
     add_run(sub)
     text = (
-        "tsdf: fuse depth maps (default); polyhedra: unite the primitives, cut back to the surface, closed "
-        "and manifold; opacity-field: where light stops reaching the cameras, closed and without a grid"
+        "tsdf: fuse depth maps on voxels, fastest, open where no camera looks (default); polyhedra: exact union of the "
+        "opaque primitives cut back to the surface, closed and manifold; opacity-field: level set of the "
+        "transmittance towards the cameras on Delaunay tetrahedra, closed"
     )
     sub.add_argument("--method", choices=("tsdf", "polyhedra", "opacity-field"), default="tsdf", help=text)
-    sub.add_argument("-o", "--output", metavar="FILE", help=".ply .obj .glb .stl (default RUN/mesh/METHOD/mesh.ply)")
-    text = "choose the size of photographs for stereo, and of voxels, so that everything takes this long"
+    sub.add_argument(
+        "-o", "--output", metavar="FILE", help=".ply, .obj, .glb or .stl (default RUN/mesh/METHOD/mesh.ply)"
+    )
+    text = (
+        "finish within TIME, such as 90s or 5m: downscale the photographs for stereo and choose the voxel size by "
+        "measured times; for --method tsdf"
+    )
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
-    text = "print the memory that each stage would take, for --method tsdf, and write nothing"
+    text = "print the estimated memory of each stage of --method tsdf and write nothing"
     sub.add_argument("--dry-run", action="store_true", help=text)
     add_threads(sub)
     add_quiet(sub)
-    text = "fuse in so many parts of one grid, each by a worker of its own, with the same result (default 1)"
+    text = (
+        "divide the grid into K parts that workers fuse in parallel; the result is that of one part with --stereo off. "
+        "For --method tsdf (default 1)"
+    )
     add_workers(sub).add_argument("--blocks", type=positive, default=1, metavar="K", help=text)
     add_options(sub.add_argument_group("extraction"), ExtractOptions)
 

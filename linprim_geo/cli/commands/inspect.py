@@ -1,4 +1,4 @@
-"""The command inspect, which reports the effects that a scene needs."""
+"""The command inspect: reports which effects a scene needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    sub = command("inspect", run, "say which effects a scene calls for, by which evidence, and what they cost")
+    sub = command("inspect", run, "report which effects a scene needs, with evidence and cost")
     add_scene(sub)
     add_quiet(sub)
     add_effects(sub)

@@ -9,15 +9,20 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    command("doctor", doctor, "check versions, libraries, cores and memory; exit 1 if something is missing")
+    command("doctor", doctor, "check the installation and the machine; exit status 1 on problems")
 
     sub = command("demo", demo, "synthesize, train, extract and score a built-in scene")
-    sub.add_argument("-o", "--output", default="runs/demo", metavar="RUN", help="folder to make (default runs/demo)")
-    sub.add_argument("--size", choices=("small", "normal"), default="normal", help="small: a quick check of it all")
+    sub.add_argument("-o", "--output", default="runs/demo", metavar="RUN", help="output folder (default runs/demo)")
+    sub.add_argument(
+        "--size",
+        choices=("small", "normal"),
+        default="normal",
+        help="small: fewer, smaller views, to check that all steps work (default normal)",
+    )
     add_threads(sub)
     add_quiet(sub)
 
-    sub = command("completion", completion, "print a script that completes this command line in a shell")
+    sub = command("completion", completion, "print a shell completion script")
     sub.add_argument("shell", choices=("bash", "zsh", "fish"))
 
 

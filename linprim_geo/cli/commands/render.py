@@ -12,7 +12,7 @@ def add(command: AddCommand) -> None:
     sub = command("render", run, "render colour, depth, normals and opacity of a run's views")
     add_run(sub)
     add_split(sub)
-    sub.add_argument("-o", "--output", metavar="DIR", help="folder to write to (default RUN/renders)")
+    sub.add_argument("-o", "--output", metavar="DIR", help="output folder (default RUN/renders)")
     add_threads(sub)
     add_quiet(sub)
 

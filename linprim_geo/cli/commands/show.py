@@ -9,24 +9,28 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    sub = command("report", report, "write one self-contained HTML page about a run")
+    sub = command("report", report, "write a self-contained HTML report of a run")
     add_run(sub)
-    sub.add_argument("-o", "--output", metavar="FILE", help="page to write (default RUN/report.html)")
+    sub.add_argument("-o", "--output", metavar="FILE", help="HTML file to write (default RUN/report.html)")
     text = (
-        "mesh in the data set's frame to score depth and meshes against (default: what RUN/eval holds, and "
-        "the data set's depth)"
+        "reference mesh in the data set's frame, to score depth and meshes against (default: show the scores in "
+        "RUN/eval, and score depth against the data set's depth maps)"
     )
     sub.add_argument("--reference", metavar="MESH", help=text)
     add_threads(sub)
 
     sub = command("view", view, "show a run in a browser: primitives, meshes, cameras")
     add_run(sub)
-    text = "wait for a run's first save, and show every save and mesh as it comes"
+    text = "wait for the first save of a run, and reload at every new save or mesh"
     sub.add_argument("--follow", action="store_true", help=text)
-    sub.add_argument("--reference", metavar="MESH", help="mesh in the data set's frame, for the true error of meshes")
-    text = "port on this machine, which alone can reach it (default 8080; 0: any that is free)"
+    sub.add_argument(
+        "--reference", metavar="MESH", help="reference mesh in the data set's frame, to colour meshes by true error"
+    )
+    text = "port to serve on, reachable from this machine only; 0: any free port (default 8080)"
     sub.add_argument("--port", type=whole, default=8080, metavar="N", help=text)
-    sub.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
+    sub.add_argument(
+        "--no-browser", dest="browser", action="store_false", help="print the address without opening a browser"
+    )
     add_threads(sub)
 
 

@@ -1,4 +1,4 @@
-"""The command stereo: from photographs with poses to depth maps and a point cloud."""
+"""The command stereo: from photographs to depth maps and a point cloud."""
 
 from __future__ import annotations
 
@@ -11,13 +11,16 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    text = "find depth, normals and confidence of every photograph, and a cloud of points, without a training"
+    text = "compute depth, normals and confidence of every photograph and a fused point cloud, without training"
     sub = command("stereo", run, text)
     add_scene(sub)
-    text = "folder to make, laid out as COLMAP's dense workspace"
+    text = "output folder, with the layout of COLMAP's dense workspace"
     sub.add_argument("-o", "--output", required=True, metavar="DIR", help=text)
-    sub.add_argument("--resume", action="store_true", help="go on with what an earlier run has left in DIR")
-    text = "average photographs down, or leave some out, so that everything takes this long, by the first ones' time"
+    sub.add_argument("--resume", action="store_true", help="continue an earlier run in DIR; finished maps are kept")
+    text = (
+        "finish within TIME, such as 90s or 10m: downscale the photographs, and if that is not enough, leave some out. "
+        "The time is estimated from up to three photographs"
+    )
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
     add_quiet(sub)
     add_options(sub.add_argument_group("stereo"), StereoOptions)

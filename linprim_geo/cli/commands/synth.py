@@ -1,4 +1,4 @@
-"""The command synth: photographs of a known surface."""
+"""The command synth: synthetic captures with ground truth."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from linprim_geo.synthetic.options import SynthOptions
 
 def add(command: AddCommand) -> None:
     sub = command("synth", run, "render posed images, depth, normals and points of a mesh or a built-in scene")
-    sub.add_argument("output", metavar="OUT", help="folder to make")
+    sub.add_argument("output", metavar="OUT", help="output folder")
     shape = sub.add_mutually_exclusive_group()
-    shape.add_argument("--scene", choices=("cad", "smooth", "room", "wires", "hall"), help="built-in (default cad)")
-    shape.add_argument("--mesh", metavar="FILE", help="any mesh with a texture or vertex colours")
-    sub.add_argument("--overwrite", action="store_true", help="replace OUT if synth has made it")
+    shape.add_argument(
+        "--scene", choices=("cad", "smooth", "room", "wires", "hall"), help="built-in scene (default cad)"
+    )
+    shape.add_argument("--mesh", metavar="FILE", help="mesh to render, with its texture or vertex colours")
+    sub.add_argument("--overwrite", action="store_true", help="replace OUT if it was written by synth")
     add_quiet(sub)
     add_options(sub.add_argument_group("capture"), SynthOptions)
 

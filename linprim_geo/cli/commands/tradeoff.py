@@ -1,4 +1,4 @@
-"""The command tradeoff: what accuracy costs in time."""
+"""The command tradeoff: measures accuracy against time."""
 
 from __future__ import annotations
 
@@ -13,13 +13,15 @@ from linprim_geo.eval.options import TradeoffOptions
 
 
 def add(command: AddCommand) -> None:
-    text = "sweep every parameter that trades time for accuracy: tables, plots, and a sentence for each"
+    text = "measure time and accuracy for each value of the parameters that trade one for the other"
     sub = command("tradeoff", run, text)
     add_scene(sub)
-    text = "folder to make, or to go on with (default runs/SCENE_tradeoff)"
+    text = "output folder; an interrupted sweep in it is continued (default runs/SCENE_tradeoff)"
     sub.add_argument("-o", "--output", metavar="DIR", help=text)
     add_options(sub.add_argument_group("sweep"), TradeoffOptions)
-    add_workers(sub, None).description = "trainings at once; without either, here, one after another"
+    add_workers(
+        sub, None
+    ).description = "Run trainings in parallel. Without these options they run in this process, one after another."
     add_quiet(sub)
 
 

@@ -24,32 +24,37 @@ from linprim_geo.cli.output import Output
 
 
 def add(command: AddCommand) -> None:
-    sub = command("train", run, "train a scene: posed photographs to primitives")
+    sub = command("train", run, "train primitives on the photographs of a scene")
     add_scene(sub, nargs="?")
-    sub.add_argument("-s", "--source", "--source_path", dest="source", metavar="SCENE", help="the same, as in 3DGS")
-    text = "folder to make (default runs/SCENE)"
+    sub.add_argument(
+        "-s", "--source", "--source_path", dest="source", metavar="SCENE", help="same as SCENE, as in 3DGS"
+    )
+    text = "run folder to write (default runs/SCENE)"
     sub.add_argument("-o", "--output", "-m", "--model_path", dest="run", metavar="RUN", help=text)
-    sub.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in RUN")
+    sub.add_argument("--resume", action="store_true", help="continue from the latest checkpoint in RUN")
     add_quiet(sub)
     text = (
-        "say what would be trained, how long it takes and how much memory, by timing a few steps; nothing but "
-        "the cache is written"
+        "time a few steps and print images, primitives, minutes and memory of the training; nothing but the cache is "
+        "written"
     )
     sub.add_argument("--dry-run", action="store_true", help=text)
     text = (
-        "choose steps and primitives so that everything takes this long, by what a step costs here; one of "
-        "the two may be given"
+        "finish within TIME, such as 90s or 5m: choose --iterations and --max-primitives by the measured time of a "
+        "step; one of the two may be given. Not with --blocks"
     )
     sub.add_argument("--time-budget", type=seconds, metavar="TIME", help=text)
-    text = "show the run in a browser meanwhile, as linprim-geo view RUN --follow does"
+    text = "show the run in a browser during training, like linprim-geo view RUN --follow"
     sub.add_argument("--view", action="store_true", help=text)
-    text = "as in 3DGS: divide the size by 1, 2, 4 or 8, or a width to go down to; -1: to 1600 if it is more"
+    text = (
+        "image size as in 3DGS. 1, 2, 4, 8: divide width and height by K; other numbers: largest width in pixels; -1: "
+        "same as --downscale auto"
+    )
     sub.add_argument("-r", "--resolution", type=int, metavar="K", help=text)
-    sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS: views are held out anyway")
+    sub.add_argument("--eval", action="store_true", help="accepted as in 3DGS, without effect; see --test-every")
     add_effects(sub)
     text = (
-        "train in so many blocks of space, each by a worker of its own; auto: as few as a worker's memory allows "
-        "(default 1); a block's photographs lie in a temporary file, see TMPDIR"
+        "divide the scene into K blocks of space, each trained by a worker; auto: the fewest that fit into a worker's "
+        "memory (default 1). A worker keeps its photographs in a temporary file in TMPDIR"
     )
     add_workers(sub).add_argument("--blocks", type=blocks, default=1, metavar="auto|K", help=text)
     add_options(sub.add_argument_group("scene"), SceneOptions)
@@ -60,7 +65,7 @@ def run(parsed: argparse.Namespace) -> Output:
     budget = time_budget(parsed)
     scene = parsed.scene or parsed.source
     if scene is None or (parsed.scene and parsed.source):
-        raise LinprimError("train wants one scene: its folder, or -s and its folder")
+        raise LinprimError("train needs exactly one scene: SCENE, or -s SCENE")
     scene_options, options = from_args(SceneOptions, parsed), from_args(TrainOptions, parsed)
     if parsed.resolution is not None:
         if "downscale" in given_options(SceneOptions, parsed):
