@@ -190,115 +190,127 @@ def raster_options(options: TrainOptions) -> dict:
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """The settings for reading a capture."""
+    """Settings for reading a capture."""
 
     pinhole_below: float = option(
-        0.0, "lenses that shift no ray by as many pixels count as pinholes and are not undistorted", low=0, metavar="PX"
+        0.0,
+        "do not undistort photographs whose lens shifts every ray by less than PX pixels",
+        low=0,
+        metavar="PX",
     )
 
     downscale: int | str = option(
         "auto",
-        f"average K by K pixels into one; auto: the fewest that leave at most {LONGEST_SIDE} along the longer side",
+        f"average K by K pixels into one; auto: the smallest K that leaves at most {LONGEST_SIDE} pixels along the "
+        "longer side",
         low=1,
         metavar="K",
         number_or="auto",
     )
     masks: str = option(
         "",
-        "folder of foreground masks, if they are not where data sets usually keep them; none: no masks and no alpha",
+        "folder of foreground masks, if it is not the one that the data set's format has; none: ignore masks and alpha",
         metavar="DIR",
     )
     images: str = option(
-        "", "folder of the photographs to use in place of those that the cameras name, in any size", metavar="DIR"
+        "", "folder with photographs, of any size, to use in place of those that the cameras name", metavar="DIR"
     )
-    frames: int = option(150, "of a video, the sharpest of each of N equal parts", low=3, metavar="N")
+    frames: int = option(
+        150, "number of frames to take from a video: the sharpest of each of N equal parts", low=3, metavar="N"
+    )
     sparse: str = option(
-        "", "COLMAP model to take points from, if it is not where data sets usually keep it", metavar="DIR"
+        "", "folder of the COLMAP model with the points, if it is not at its usual place", metavar="DIR"
     )
     test_every: int | str = option(
         "auto",
-        "hold out every Nth photograph by name; 0: none, all are trained on and count for the mesh; auto: those that "
-        "the data set names, else every 8th",
+        "hold out every Nth photograph by name for scoring; 0: none, all are used for training and for the mesh; auto: "
+        "those that the data set names, else every 8th",
         low=0,
         high=10**6,
         metavar="N",
         number_or="auto",
     )
-    views: int = option(0, "train with N of the training views, evenly spread over them; 0 takes all", low=0)
+    views: int = option(0, "use only N of the training views, evenly spread; 0: all", low=0)
     poses: str = option(
         "auto",
-        "auto: poses that come with a capture are adjusted where keypoints say that they err; given: they are taken as "
-        "they are",
+        "auto: test the poses of the capture by keypoints, and adjust them if they are inaccurate; given: use them "
+        "unchanged",
         choices=("auto", "given"),
     )
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """The settings for training a scene."""
+    """Settings for training a scene."""
 
-    iterations: int = option(7000, "training steps, one view each", low=1, high=10**8)
-    primitive: str = option("octahedron", "what the scene is made of", choices=tuple(KINDS))
+    iterations: int = option(7000, "training steps; each uses one view", low=1, high=10**8)
+    primitive: str = option("octahedron", "kind of primitive", choices=tuple(KINDS))
     ray_model: str = option(
         "exact",
-        "how rays meet them: exact perspective, or LinPrim's affine approximation at each centre (always so with "
-        "gaussian)",
+        "exact: intersect perspective rays with the primitives; affine: LinPrim's approximation at the centre of each "
+        "primitive (gaussian: always affine)",
         choices=("exact", "affine"),
     )
     order: str = option(
         "center",
-        "order of blending: by the centres' depth, by each ray's entries, or none (overlap: densities add up exactly)",
+        "order of blending. center: by depth of the centres, fastest; entry: by each ray's entry into the primitives; "
+        "overlap: none, densities add up exactly where primitives overlap. The last two take about 3 times the time "
+        "of a frame",
         choices=("center", "entry", "overlap"),
     )
     filter: str = option(
         "none",
-        "against aliasing: 3d enlarges each by a part of a pixel of its nearest view, 3d+screen also on every screen",
+        "anti-aliasing. 3d: enlarge each primitive by a fraction of a pixel of its nearest view; 3d+screen: enlarge "
+        "it also in every rendered image",
         choices=("none", "3d", "3d+screen"),
     )
     population: str = option(
         "gradient",
-        "how their number grows: gradient splits where the image pulls, 3dgs and mcmc are those papers' rules",
+        "densification. gradient: split primitives with large image gradients; 3dgs, mcmc: the rules of these papers",
         choices=("gradient", "3dgs", "mcmc"),
     )
-    max_primitives: int = option(20_000, "the population never grows past this", low=1, high=2**30)
+    max_primitives: int = option(20_000, "largest number of primitives", low=1, high=2**30)
     initial_primitives: int = option(
-        0, "primitives at the start; 0 chooses from the points and --max-primitives", low=0, high=2**30
+        0, "number of primitives at the start; 0: chosen by the points and --max-primitives", low=0, high=2**30
     )
     start: str = option(
         "stereo",
-        "where primitives begin: where stereo of small copies of the photographs finds surfaces, if the capture has "
-        "fewer points than that takes, or at its points alone",
+        "initial positions of primitives. stereo: the capture's points, and if these are too few also surfaces found "
+        "by stereo of downscaled photographs; points: the capture's points only",
         choices=("stereo", "points"),
     )
-    sh_degree: int = option(2, "degree of the view-dependent colour, 0 to 3", choices=(0, 1, 2, 3))
-    seed: int = option(0, "seed of everything random", low=0, high=2**63)
-    threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it", low=0, high=4096)
+    sh_degree: int = option(
+        2, "degree of the spherical harmonics of view-dependent colour; 0 for matt scenes", choices=(0, 1, 2, 3)
+    )
+    seed: int = option(0, "random seed", low=0, high=2**63)
+    threads: int = option(0, "number of threads; 0: one per core. The result does not depend on it", low=0, high=4096)
     background: str = option(
         "auto",
-        "auto, environment, fitted, random, black, white, or r,g,b in [0,1]; auto: an environment at infinity if "
-        "the scene is open,"
-        " fitted before a plain backdrop, else random",
+        "background behind all primitives: environment (cube map at infinity, trained), fitted (one colour, trained), "
+        "random in each step, black, white, or r,g,b in [0,1]. auto: environment for open scenes, fitted for a plain "
+        "backdrop, else random",
     )
     exposure: str = option(
         "none",
-        "gain fits a factor per channel for every training photograph, of geometric mean 1; renders have the "
-        "mean exposure",
+        "gain: fit a factor per colour channel for every training photograph, with geometric mean 1 over the "
+        "photographs; renders have the mean exposure",
         choices=("none", "gain"),
     )
     scalar: str = option(
         "float32",
-        "numbers that rendering computes in, in training too; parameters are kept in float32 either way",
+        "precision of rendering, also in training; parameters are always kept in float32",
         choices=("float32", "float64"),
     )
     adam: str = option(
         "dense",
-        "optimiser step over all primitives, or over those that a view touched (sparse: the others' moments rest)",
+        "optimiser. dense: update all primitives in each step; sparse: only those that the view touches, with their "
+        "moments",
         choices=("dense", "sparse"),
     )
     dropout: float | str = option(
         "auto",
-        "share of the primitives that each step leaves out at random, neighbours together; auto: 0.2 of captures with "
-        "10 training photographs at most, not in --blocks, else 0",
+        "share of the primitives that each step leaves out, in random groups of neighbours; auto: 0.2 with at most 10 "
+        "training photographs and without --blocks, else 0",
         low=0,
         high=0.9,
         metavar="X",
@@ -306,47 +318,62 @@ class TrainOptions:
     )
     stereo_depth: float = option(
         1.0,
-        "weight: surfaces lie within 1 % of the depths that stereo of small copies of the photographs finds; not of "
-        "captures with masks, and not in --blocks",
+        "weight of the loss on rendered depths that differ by more than 1 % from stereo of downscaled photographs; "
+        "unused with masks; with --blocks only for the coarse scene",
         low=0,
         high=1e6,
     )
     order_from: float = option(
         0.0,
-        "part of the run after which --order holds; before it, training blends in the faster order of the centres",
+        "share of the run after which --order is used; before, training uses the faster order center",
         low=0,
         high=1,
     )
-    dssim: float = option(0.2, "weight of D-SSIM in the loss; L1 has the rest", low=0, high=1)
+    dssim: float = option(0.2, "weight of D-SSIM in the image loss; L1 has the rest", low=0, high=1)
     geometry_from: float = option(
-        0.7, "part of the run after which the terms with the weights below join the loss", low=0, high=1
+        0.7, "share of the run after which the six terms below are added to the loss", low=0, high=1
     )
-    normal_consistency: float = option(0.0, "weight: faces point as the surface that they make up", low=0, high=1e6)
-    distortion: float = option(0.0, "weight: what a ray sees lies together in depth", low=0, high=1e6)
-    binarisation: float = option(0.0, "weight: primitives are opaque or nothing", low=0, high=1e6)
+    normal_consistency: float = option(
+        0.0, "weight of the loss on the angle between face normals and normals of the depth map", low=0, high=1e6
+    )
+    distortion: float = option(0.0, "weight of the loss on the spread in depth along a ray", low=0, high=1e6)
+    binarisation: float = option(
+        0.0, "weight of the loss on the entropy of opacities; makes them 0 or 1", low=0, high=1e6
+    )
     point_depth: float = option(
-        0.0, "weight: surfaces pass through the scene's points, by their errors", low=0, high=1e6
+        0.0,
+        "weight of the loss on rendered depths at the capture's points, which count by their errors",
+        low=0,
+        high=1e6,
     )
-    sensor_depth: float = option(0.0, "weight: surfaces lie at the depths that the data set brings", low=0, high=1e6)
-    sensor_normals: float = option(0.0, "weight: faces point as the normals that the data set brings", low=0, high=1e6)
-    stop: float = option(1e-3, "transmittance below which a ray ends", low=0, high=0.5, metavar="T")
+    sensor_depth: float = option(
+        0.0, "weight of the loss on rendered depths, compared with the data set's depth maps", low=0, high=1e6
+    )
+    sensor_normals: float = option(
+        0.0, "weight of the loss on rendered normals, compared with the data set's normal maps", low=0, high=1e6
+    )
+    stop: float = option(1e-3, "end a ray when its transmittance falls below T", low=0, high=0.5, metavar="T")
     samples: int = option(
-        1, "K by K rays per pixel: 1 is fastest, 2 resolves edges that cut through pixels", low=1, high=8, metavar="K"
+        1,
+        "K by K rays per pixel; 2 reduces aliasing at sharp edges, with 4 times the rays of 1",
+        low=1,
+        high=8,
+        metavar="K",
     )
     checkpoint_every: int = option(1000, "steps between checkpoints", low=1, high=10**9, metavar="STEPS")
     evaluate_every: int = option(
-        1000, "steps between scores on the held-out views; 0 scores only at the end", low=0, high=10**9, metavar="STEPS"
+        1000, "steps between scores of held-out views; 0: only at the end", low=0, high=10**9, metavar="STEPS"
     )
 
 
 @dataclass(frozen=True)
 class ExtractOptions:
-    """The settings for extracting a surface from a run."""
+    """Settings for extracting a surface from a run."""
 
     level: float | str = option(
         "auto",
-        "transmittance at which the surface is taken, between 0 and 1, nearer to 1 is nearer to the cameras;"
-        " auto: the nearest of those at which the photographs agree about as well as at the best",
+        "iso-level: transmittance of a ray at the surface, between 0 and 1; higher is nearer to the cameras. auto: of "
+        "the levels with about the best photo-consistency, the one nearest to the cameras",
         low=1e-6,
         high=1 - 1e-6,
         metavar="T",
@@ -354,57 +381,55 @@ class ExtractOptions:
     )
     voxel_size: float = option(
         0.0,
-        "grid spacing in the data set's unit, for tsdf and opacity-field; 0 chooses from the views, and for tsdf "
-        "small voxels where the surface bends",
+        "edge length of voxels (tsdf) or point spacing (opacity-field), in the data set's unit; 0: chosen by the size "
+        "of pixels on the surface, for tsdf smaller where it bends",
         low=0,
         metavar="LENGTH",
     )
     truncation: float = option(3.0, "truncation distance in voxels, for tsdf", low=1, high=100)
     memory_limit: float = option(
         0.0,
-        "memory that the extraction may take, in GiB: depth maps that are kept, and the grid, whose voxels are larger "
-        "where they would not fit, unless their size is given; 0 allows 60 % of what is free for the grid",
+        "memory that the extraction may use, in GiB; voxels are enlarged to fit, unless their size is given. 0: the "
+        "grid may use 60 % of the free memory",
         low=0,
         metavar="GIB",
     )
     depth_limit: float = option(
         0.0,
-        "depths beyond this, in the data set's unit, only clear the space before them, for tsdf; 0: where "
-        "photographs cannot measure them",
+        "tsdf: largest depth that is fused, in the data set's unit; larger ones only clear the space in front of "
+        "them. 0: chosen by the accuracy of triangulation",
         low=0,
         metavar="LENGTH",
     )
     stereo: str = option(
         "auto",
-        "fuse the depths that PatchMatch stereo finds in the photographs where views confirm them, and leave out what "
-        "no two photographs support: on, off, or auto: not where that leaves most pixels open and photographs agree "
-        "with it clearly less, and with masks only where they agree with it more; with --method tsdf, without --blocks",
+        "tsdf without --blocks: fuse PatchMatch stereo depths that other views confirm, and leave out surface that no "
+        "two photographs support. auto: not if this surface is missing in most pixels and the one without stereo has "
+        "better photo-consistency; with masks, only if stereo has the better photo-consistency",
         choices=("auto", "on", "off"),
     )
-    held_out: bool = option(
-        False, "held-out photographs count for the mesh, too: its depth, its refinement and its colours"
-    )
+    held_out: bool = option(False, "use held-out photographs, too, for depth, refinement and colours of the mesh")
     box: str = option(
         "",
-        "the surface within these corners alone, in the data set's frame, written --box=...; auto: within what the "
-        "cameras look at",
+        "extract only the surface inside these corners, in the data set's frame, written --box=...; auto: around the "
+        "place that the cameras look at",
         metavar="auto|X0,Y0,Z0,X1,Y1,Z1",
     )
     object: bool = option(
         False,
-        "the object alone that the cameras look at: without the plane that it stands on, which closes it, and without "
-        "what reaches out of --box, by default auto",
+        "extract only the object that the cameras look at: remove its supporting plane, close the opening there, and "
+        "drop parts that reach out of --box (default auto here)",
     )
     smallest_part: float = option(
         0.01,
-        "drop components with less than this share of the largest one's area, if stereo does not support them",
+        "drop components smaller than this share of the largest one's area, unless stereo confirms them",
         low=0,
         high=1,
     )
     refine: int | str = option(
         "auto",
-        "rounds in which vertices move to where the photographs agree best with each other; 0 leaves them; auto: 2, "
-        "and 0 after stereo, which is more accurate than they can be moved",
+        "rounds of refinement, which moves vertices to the best photo-consistency; 0: none; auto: 0 if stereo is used, "
+        "which is more accurate, else 2",
         low=0,
         high=100,
         metavar="N",
@@ -412,38 +437,35 @@ class ExtractOptions:
     )
     denoise: str = option(
         "on",
-        "on: smooth the surface, but for edges and where photographs are sure: no vertex moves farther than its "
-        "predicted error; then put creases where the flat parts beside them meet, and outlines where masks show them; "
-        "off: leave it",
+        "on: smooth noise with edges preserved, each vertex by at most its predicted error; then sharpen creases "
+        "between flat parts, and move silhouettes to those of the masks",
         choices=("on", "off"),
     )
     close_holes: int | str = option(
         "auto",
-        "fill holes with at most N edges around them; 0 fills none; auto: after stereo those that are no wider than a "
-        "window of stereo and that no photograph sees through",
+        "fill holes with at most N boundary edges; 0: none; auto: with stereo, fill holes no wider than a stereo "
+        "window that no two photographs see through",
         low=0,
         high=10**9,
         metavar="N",
         number_or="auto",
     )
-    smooth: int = option(
-        0, "iterations of smoothing that keeps the volume; 0 leaves the surface as it is", low=0, high=10_000
-    )
+    smooth: int = option(0, "iterations of Taubin smoothing, which preserves volume; 0: none", low=0, high=10_000)
     remesh: float = option(
-        0.0, "even triangles with edges of this length, in the data set's unit; 0 keeps them", low=0, metavar="LENGTH"
+        0.0, "remesh to even triangles with this edge length, in the data set's unit; 0: off", low=0, metavar="LENGTH"
     )
     tolerance: float | str = option(
         0.0,
-        "simplify, so that flat parts have few faces, as far as no vertex of the surface is farther from what is left, "
-        "in the data set's unit; auto: than half of its predicted error; 0 keeps all faces",
+        "simplify while every vertex stays within this distance of the simplified surface, in the data set's unit; "
+        "auto: within half of its predicted error; 0: off",
         low=0,
         metavar="LENGTH",
         number_or="auto",
     )
-    target_faces: int = option(0, "simplify to N faces; 0 keeps all", low=0, high=10**9)
+    target_faces: int = option(0, "simplify to N faces by edge collapse; 0: off", low=0, high=10**9)
     texture: int = option(
         0,
-        "give .obj and .glb a texture of SIZE by SIZE texels out of the photographs; 0 gives vertex colours",
+        "bake a texture of SIZE by SIZE texels from the photographs, for .obj and .glb; 0: vertex colours",
         low=0,
         metavar="SIZE",
     )
@@ -451,14 +473,14 @@ class ExtractOptions:
 
 @dataclass(frozen=True)
 class StereoOptions:
-    """The settings of dense stereo."""
+    """Settings of dense stereo."""
 
     least_confidence: float = option(
         0.5,
-        "depths become points where they are right within 1 % with at least this probability",
+        "least confidence of points in the fused cloud: the probability that the depth is right within 1 %",
         low=0,
         high=1,
         metavar="P",
     )
-    seed: int = option(0, "seed of everything random", low=0, high=2**31)
-    threads: int = option(0, "worker threads; 0 uses every core; the result does not depend on it", low=0, high=4096)
+    seed: int = option(0, "random seed", low=0, high=2**31)
+    threads: int = option(0, "number of threads; 0: one per core. The result does not depend on it", low=0, high=4096)
