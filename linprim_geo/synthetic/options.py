@@ -57,95 +57,114 @@ class SynthOptions:
     training photographs with the cameras as written, as many as are found.
     """
 
-    views: int = option(60, "training views", low=2)
-    test_views: int = option(12, "held-out views, which lie between the others", low=0)
-    size: int | tuple[int, int] = option(320, "pixels", metavar="WxH", parse=parse_size)
-    path: str | None = option(None, "of the cameras (default: what suits the scene)", choices=PATHS)
-    fov: float | None = option(None, "horizontal (default 45, inside 75)", low=1, high=170, metavar="DEGREES")
-    distance: float | None = option(None, "from the middle, in the mesh's unit", positive=True, metavar="LENGTH")
+    views: int = option(60, "number of training views", low=2)
+    test_views: int = option(12, "number of held-out views, placed between the training views", low=0)
+    size: int | tuple[int, int] = option(
+        320, "image size in pixels, such as 640x480, or 320 for 320x320", metavar="WxH", parse=parse_size
+    )
+    path: str | None = option(None, "camera path (default: by the scene)", choices=PATHS)
+    fov: float | None = option(
+        None, "horizontal field of view (default 45; inside-out 75)", low=1, high=170, metavar="DEGREES"
+    )
+    distance: float | None = option(
+        None, "distance of the cameras from the centre, in the mesh's unit", positive=True, metavar="LENGTH"
+    )
     principal_point_offset: tuple[float, float] = option(
         (0.0, 0.0),
-        "from the middle of the image, in pixels; a negative one is written --...=-5,3",
+        "offset of the principal point from the image centre, in pixels; write --...=-5,3 if X is negative",
         metavar="X,Y",
         parse=parse_pair,
     )
-    shading: str = option("albedo", "colours as they are, or under lamps", choices=("albedo", "shaded"))
+    shading: str = option(
+        "albedo", "albedo: unlit colours; shaded: lit by two distant lamps", choices=("albedo", "shaded")
+    )
     background: str | Color | None = option(
         None,
-        "transparent, black, white or r,g,b in [0,1] (default: transparent around an object, black inside)",
+        "background: transparent, black, white or r,g,b in [0,1] (default: transparent around an object, black inside)",
         metavar="COLOR",
     )
-    points: int = option(20_000, "points as of structure from motion, on the surface", low=0)
+    points: int = option(20_000, "number of sparse points, as from structure from motion", low=0)
     point_noise: float = option(
-        0.0, "standard deviation per axis of the points, in the mesh's unit", low=0, metavar="LENGTH"
+        0.0, "standard deviation of the points' noise per axis, in the mesh's unit", low=0, metavar="LENGTH"
     )
-    supersample: int = option(3, "K*K rays a pixel", low=1, high=16, metavar="K")
-    depth_format: str = option("png", "depth maps, in whole steps or as float32", choices=("png", "npy"))
-    detail: float = option(1.0, "contrast of a built-in scene's texture", low=0, high=10)
+    supersample: int = option(3, "K by K rays per pixel", low=1, high=16, metavar="K")
+    depth_format: str = option(
+        "png", "format of depth maps: png in integer steps, npy in float32", choices=("png", "npy")
+    )
+    detail: float = option(1.0, "factor on the contrast of a built-in scene's texture", low=0, high=10)
     texture: str = option(
-        "strong", "of a built-in scene: weak has a tenth of the contrast", choices=("strong", "weak", "plain")
+        "strong",
+        "texture of a built-in scene: weak has a tenth of the contrast of strong, plain has none",
+        choices=("strong", "weak", "plain"),
     )
     exposure_drift: float = option(
-        0.0, "gains of the training photographs vary by up to exp(X) each way", low=0, high=2
+        0.0, "exposure gains of the training photographs vary by up to a factor of exp(X) up and down", low=0, high=2
     )
     distortion: float = option(
         0.0,
-        "k1 of a lens with radial distortion; a negative one is written --...=-0.1",
+        "radial distortion k1 of the lens; write --...=-0.1 if it is negative",
         low=-0.5,
         high=0.5,
         metavar="K1",
     )
-    specular: float = option(0.0, "strength of highlights that move with the camera", low=0, high=10)
-    zoom: float = option(1.0, "every third camera has X times the focal length", low=0.1, high=10)
-    table: float = option(0.0, "stand it on a table X times as wide as it is; 0: none", low=0, high=100)
-    environment: int | None = option(None, "a room at infinity, drawn by seed N, in place of a background", low=0)
-    arc: float | None = option(
-        None, "of azimuth that the path arc covers (default 300)", low=1, high=360, metavar="DEGREES"
-    )
+    specular: float = option(0.0, "strength of specular highlights", low=0, high=10)
+    zoom: float = option(1.0, "factor on the focal length of every third camera", low=0.1, high=10)
+    table: float = option(0.0, "put the object on a table X times as wide as the object; 0: none", low=0, high=100)
+    environment: int | None = option(None, "show a room at infinity as background, made with random seed N", low=0)
+    arc: float | None = option(None, "azimuth range of --path arc (default 300)", low=1, high=360, metavar="DEGREES")
     noise: float = option(0.0, "standard deviation of sensor noise at middle grey, in units of 1/255", low=0, high=100)
-    jpeg: int = option(0, "photographs as .jpg of this quality; 0: .png", low=0, high=100, metavar="QUALITY")
-    camera: str = option("ideal", "phone: all effects of a camera below at once", choices=("ideal", "phone"))
-    full_well: float = option(
-        0.0, "electrons of a pixel at white, whose random arrival is shot noise; 0: none", low=0, metavar="ELECTRONS"
+    jpeg: int = option(0, "write photographs as JPEG of this quality; 0: PNG", low=0, high=100, metavar="QUALITY")
+    camera: str = option(
+        "ideal",
+        "phone: set all camera effects below that are not given, as of a hand-held phone",
+        choices=("ideal", "phone"),
     )
-    read_noise: float = option(0.0, "standard deviation of the electronics", low=0, metavar="ELECTRONS")
+    full_well: float = option(
+        0.0, "electrons of a white pixel, which determine the shot noise; 0: no shot noise", low=0, metavar="ELECTRONS"
+    )
+    read_noise: float = option(0.0, "standard deviation of the read noise", low=0, metavar="ELECTRONS")
     mosaic: str = option(
-        "none", "bayer: a pixel measures one colour, and has the others from its neighbours", choices=("none", "bayer")
+        "none", "bayer: each pixel measures one colour channel; the others are interpolated", choices=("none", "bayer")
     )
     exposure_walk: float = option(
-        0.0, "exposure drifts smoothly along the training views by up to X stops", low=0, high=4
+        0.0, "smooth drift of the exposure along the training views, up to X stops", low=0, high=4
     )
     white_balance: float = option(
-        0.0, "red and blue drift smoothly by up to this share, opposite ways", low=0, high=0.5
+        0.0, "smooth drift of red and blue in opposite directions, up to this share", low=0, high=0.5
     )
-    vignetting: float = option(0.0, "share of the light that is lost in the corners", low=0, high=1)
-    tone: float = option(0.0, "share of an S-shaped tone curve", low=0, high=1)
-    motion_blur: float = option(0.0, "mean length of the motion during the exposure", low=0, high=100, metavar="PIXELS")
+    vignetting: float = option(0.0, "share of the light lost in the image corners", low=0, high=1)
+    tone: float = option(0.0, "strength of an S-shaped tone curve, 0 to 1", low=0, high=1)
+    motion_blur: float = option(0.0, "mean length of the motion blur", low=0, high=100, metavar="PIXELS")
     pose_error: float = option(
-        0.0, "points move by this much in the image, as poses err (root mean square)", low=0, high=100, metavar="PIXELS"
+        0.0, "error of the written poses: RMS shift of points in the image", low=0, high=100, metavar="PIXELS"
     )
     focal_error: float = option(
-        0.0, "focal lengths are reported too long by this share; negative: --...=-0.005", low=-0.5, high=0.5
+        0.0, "relative error of the written focal length; write --...=-0.005 if it is negative", low=-0.5, high=0.5
     )
     points_from: str = option(
-        "surface", "points of the surface, or triangulated from the photographs", choices=("surface", "photographs")
+        "surface",
+        "surface: sample sparse points on the surface; photographs: triangulate them from the photographs",
+        choices=("surface", "photographs"),
     )
     realism: str | None = option(
         None,
-        "a scene with light and materials, by path tracing (extra realism); --mesh is its figure",
+        "render this scene by path tracing, with light and materials; --mesh replaces its figure. Needs pip install "
+        "'linprim-geo[realism]'",
         choices=("attic", "bedroom", "courtyard", "desk", "facade", "garden", "kitchen", "shelf", "statue", "terrace"),
     )
-    samples: int = option(128, "light paths a pixel of --realism", low=4, high=65536)
+    samples: int = option(128, "light paths per pixel of --realism", low=4, high=65536)
     denoise: str = option(
         "off",
-        "on: remove the grain of these paths, which no camera has, by Open Image Denoise",
+        "on: remove the Monte Carlo noise of --realism with Open Image Denoise",
         choices=("on", "off"),
     )
     tracer: str = option(
-        "scalar", "of --realism; llvm takes half the time and wants a libLLVM that fits", choices=("scalar", "llvm")
+        "scalar",
+        "Mitsuba variant of --realism; llvm takes half the time and needs a compatible libLLVM",
+        choices=("scalar", "llvm"),
     )
-    seed: int = option(0, "seed of everything random", low=0)
-    threads: int = option(0, "0 uses every core; the files do not depend on it", low=0)
+    seed: int = option(0, "random seed", low=0)
+    threads: int = option(0, "number of threads; 0: one per core. The files do not depend on it", low=0)
 
     @property
     def width_height(self) -> tuple[int, int]:
