@@ -1,16 +1,17 @@
-"""What each geometry-aware term of training buys, and costs: `python -m linprim_geo.eval.studies.ablation_geometry -o
-runs/ablation`.
+"""Measures the gain and the cost of each geometry term of training.
 
-A scene is trained once with photographs alone. Every variant, and `plain` too, then repeats the last part of that run
-from the same checkpoint with one or more terms switched on, so nothing differs before. Each is meshed and scored
-against the exact surface, or where a capture has only depth images, against these. `ablation.json` and `ablation.txt`
-hold per scene and variant
+    python -m linprim_geo.eval.studies.ablation_geometry -o runs/ablation
 
-    PSNR of held-out views, depth AbsRel of held-out views, Chamfer distance in % of the reference's diagonal by
-    extraction method, normal consistency, and the CPU seconds of the steps that were repeated
+Each scene is trained once on photographs alone. Every variant, `plain` included, then repeats the last part of this
+training from the same checkpoint with one or more terms switched on, so that the first part is the same for all. Each
+result is meshed and scored against the exact surface or, where a capture has only depth images, against these.
+`ablation.json` and `ablation.txt` hold per scene and variant
 
-and the median over the scenes of each ratio to the plain run. What is trained already is taken from the output folder.
-The scenes `cad`, `smooth`, `room` and `wires` are built in; others are captures (`--data`).
+    PSNR of held-out views, depth AbsRel of held-out views, Chamfer distance in % of the reference's diagonal for each
+    extraction method, normal consistency, and the CPU seconds of the repeated steps
+
+and the median over the scenes of each score's ratio to the plain run. Trainings in the output folder are reused. The
+scenes `cad`, `smooth`, `room` and `wires` are built in; others are captures (`--data`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from linprim_geo.base.files import write_json
 from linprim_geo.base.options import SceneOptions, TrainOptions
 from linprim_geo.eval.study_tables import write_table
 
-# Options that a variant changes; `all` of a kind of scene are those that are recommended for it.
+# Options that each variant changes.
 VARIANTS: dict[str, dict] = {
     "plain": {},
     "normal": {"normal_consistency": 0.05},
@@ -57,8 +58,8 @@ COLUMNS = {
 
 
 def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options: SceneOptions) -> None:
-    """Train with photographs alone, unless the folder holds that run; keep the checkpoint of the step from which on
-    variants use further terms."""
+    """Train on photographs alone, unless the folder holds that run, and keep the checkpoint of the step at which the
+    variants branch off."""
     from linprim_geo.training.train import train
 
     if (folder / "run.json").exists():
@@ -68,8 +69,8 @@ def train_base(capture: Path, folder: Path, options: TrainOptions, scene_options
 
 
 def train_variant(base: Path, folder: Path, changed: dict) -> None:
-    """Repeat the last part of `base` with other options, unless the folder holds that run; write its CPU seconds to
-    `seconds.json`."""
+    """Repeat the last part of `base` with changed options, unless the folder holds that run, and write its CPU seconds
+    to `seconds.json`."""
     from linprim_geo.runs.run import Run
     from linprim_geo.training.train import train
 
@@ -94,7 +95,7 @@ def train_variant(base: Path, folder: Path, changed: dict) -> None:
 
 
 def branch_step(options: TrainOptions) -> int:
-    """Return the step from which on variants differ: where the terms join the loss."""
+    """Return the step at which variants branch off, where the geometry terms join the loss."""
     return round(options.geometry_from * options.iterations)
 
 
@@ -128,7 +129,7 @@ def score(folder: Path, reference: Path | None, methods: tuple[str, ...]) -> dic
 
 
 def ratios(rows: dict[str, dict[str, dict]]) -> dict[str, dict]:
-    """Return, for each variant, the median over scenes of each score divided by that of the plain run; for PSNR the
+    """Return, for each variant, the median over scenes of each score divided by that of the plain run; for PSNR, of the
     difference in dB."""
     from statistics import median
 
@@ -168,21 +169,30 @@ def main(arguments: list[str] | None = None) -> int:
         "--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)"
     )
     parser.add_argument(
-        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
+        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of captures to add"
     )
     parser.add_argument(
-        "--references", nargs="*", type=Path, default=[], metavar="MESH", help="their surfaces, in the same order"
+        "--references",
+        nargs="*",
+        type=Path,
+        default=[],
+        metavar="MESH",
+        help="reference meshes of these captures, in the same order",
     )
     parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS), help="default: all")
     parser.add_argument(
-        "--methods", nargs="+", default=["tsdf", "polyhedra"], help="of extraction (default: %(default)s)"
+        "--methods", nargs="+", default=["tsdf", "polyhedra"], help="extraction methods (default: %(default)s)"
     )
-    parser.add_argument("--size", type=int, default=256, help="pixels of the built-in scenes (default: %(default)s)")
+    parser.add_argument(
+        "--size", type=int, default=256, help="image side of the built-in scenes, in pixels (default: %(default)s)"
+    )
     parser.add_argument("--iterations", type=int, default=4000, help="default: %(default)s")
     parser.add_argument("--max-primitives", type=int, default=4000, help="default: %(default)s")
-    parser.add_argument("--downscale", type=int, default=1, help="of the captures (default: %(default)s)")
+    parser.add_argument(
+        "--downscale", type=int, default=1, help="average K by K pixels of the captures (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
-    parser.add_argument("--threads", type=int, default=0, help="of training; 0 uses every core (default)")
+    parser.add_argument("--threads", type=int, default=0, help="threads of training; 0: one per core (default)")
     given = parser.parse_args(arguments)
     try:
         run(given)
@@ -193,7 +203,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run the whole command."""
+    """Run the study."""
     from linprim_geo.synthetic.synth import synthesize
 
     if given.references and len(given.references) != len(given.data):

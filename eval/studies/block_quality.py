@@ -1,11 +1,11 @@
-"""What blocks cost in quality: a street trained whole and in blocks. `python -m linprim_geo.eval.studies.block_quality
--o runs/block_quality`.
+"""Measures the quality lost by training in blocks, on a street trained as a whole and in blocks.
 
-Per number of blocks: held-out PSNR, Chamfer distance of the fused surface in % of the diagonal, the same within one
-margin of the borders between blocks and elsewhere, primitives, the most memory that a worker took, and seconds of all
-workers. The borders are those of the
-largest number of blocks, for all rows: what the whole run errs there is what a seam is compared with. What the output
-folder holds already is not done again.
+    python -m linprim_geo.eval.studies.block_quality -o runs/block_quality
+
+`block_quality.md` holds per number of blocks: held-out PSNR, Chamfer distance of the fused surface in % of the
+diagonal, the mean distance within one margin of the borders between blocks and elsewhere, primitives, the largest
+memory of a worker, and the seconds of all workers. All rows use the borders of the largest number of blocks, so that
+the run without blocks shows the error at the same places without seams. Results in the output folder are reused.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ COLUMNS = {
 
 
 def border_distance(blocks, xyz: np.ndarray) -> np.ndarray:
-    """Return (P,) the distance of (P, 3) points to the nearest border of the block that contains each; infinite where
-    there is none."""
+    """Return (P,) the distance of each of (P, 3) points to the nearest border of the block that contains it; infinite
+    if there is none."""
     found = np.full(len(xyz), np.inf)
     for block in blocks:
         inside = block.holds(xyz)
@@ -56,7 +56,7 @@ def borders(run: Path) -> tuple[list, float]:
 
 def score(run: Path, reference: Path, blocks, margin: float) -> dict:
     """Return the Chamfer distance of the visible parts, and the mean distances of points within a margin of the borders
-    and of the others, visible or not."""
+    and of all other points, visible or not."""
     from linprim_geo.eval.mesh import score_mesh
     from linprim_geo.eval.surface_samples import SurfaceDistance, sample_surface
     from linprim_geo.geometry.mesh import clean_mesh
@@ -92,7 +92,7 @@ def table(rows: list[dict]) -> str:
 
 
 def run(given: argparse.Namespace) -> list[dict]:
-    """Run the missing trainings, score all of them, and write the table."""
+    """Run the missing trainings, score all of them and write the table."""
     from linprim_geo.base.progress import Progress
     from linprim_geo.eval.studies.street import street
     from linprim_geo.jobs.executor import Task
@@ -164,15 +164,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture, runs and results"
     )
-    parser.add_argument("--houses", type=int, default=8, help="length of the street (default: %(default)s)")
-    parser.add_argument("--views", type=int, default=600, help="training views (default: %(default)s)")
-    parser.add_argument("--size", type=int, default=160, help="pixels (default: %(default)s)")
-    parser.add_argument("--points", type=int, default=40_000, help="of the capture (default: %(default)s)")
-    parser.add_argument("--blocks", type=int, nargs="+", default=[1, 4, 9], help="default: 1 4 9")
-    parser.add_argument("--iterations", type=int, default=20_000, help="of the whole (default: %(default)s)")
-    parser.add_argument("--max-primitives", type=int, default=30_000, help="of the whole (default: %(default)s)")
-    parser.add_argument("--workers", type=int, default=0, help="at once; 0: one per core (default)")
-    parser.add_argument("--threads", type=int, default=1, help="of making the capture (default: %(default)s)")
+    parser.add_argument("--houses", type=int, default=8, help="length of the street in houses (default: %(default)s)")
+    parser.add_argument("--views", type=int, default=600, help="number of training views (default: %(default)s)")
+    parser.add_argument("--size", type=int, default=160, help="image side in pixels (default: %(default)s)")
+    parser.add_argument("--points", type=int, default=40_000, help="points of the capture (default: %(default)s)")
+    parser.add_argument("--blocks", type=int, nargs="+", default=[1, 4, 9], help="numbers of blocks (default: 1 4 9)")
+    parser.add_argument(
+        "--iterations", type=int, default=20_000, help="steps for the whole scene (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--max-primitives", type=int, default=30_000, help="primitives of the whole scene (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--workers", type=int, default=0, help="largest number of workers at a time; 0: one per core (default)"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="threads for making the capture (default: %(default)s)")
     given = parser.parse_args(arguments)
     try:
         if max(given.blocks) < 2:

@@ -1,16 +1,19 @@
-"""Depth maps of stereo, and what their confidence is worth, where depth is known: `python -m
-linprim_geo.eval.studies.dense_stereo -o runs/stereo --data CAPTURE ... --references MESH ...`.
+"""Measures the accuracy of stereo depth maps, and the calibration of their confidence, on captures with known depth.
 
-Of each capture's first photographs by name (`--photographs`) all pixels with a depth are compared with the mesh, by one
-ray each. `dense_stereo.md` holds per capture
+    python -m linprim_geo.eval.studies.dense_stereo -o runs/stereo --data CAPTURE ... --references MESH ...
 
-    coverage, the share of the pixels that show the mesh and have a depth; the shares of the depths within 1 and 2 % of
-    the true one (a pixel beside the mesh has none: its depth is wrong); the mean predicted probability of 1 %, and the
-    calibration error: the mean distance of predicted and true shares in ten bins of the prediction, by their pixels;
-    core-seconds per photograph,
+The first photographs of each capture by name are taken (`--photographs`). All of their pixels with a depth are compared
+with the mesh by one ray each. `dense_stereo.md` holds per capture
 
-and the reliability tables of the captures that the law was fitted to (`--fitted`) and of the others. `--fit` prints the
-weights of `stereo.confidence` that fit the former. What the output folder holds already is not done again.
+    coverage: the share of the pixels showing the mesh that have a depth;
+    the shares of the depths within 1 and 2 % of the true depth (a depth where a ray misses the mesh counts as wrong);
+    the mean predicted probability of an error below 1 %;
+    the calibration error: the mean distance of predicted and true shares in ten bins of the prediction, weighted by
+    their pixels;
+    core-seconds per photograph;
+
+and reliability tables of the captures to which the confidence was fitted (`--fitted`) and of the others. `--fit` prints
+the weights of `stereo.confidence` that fit the former. Results in the output folder are reused.
 """
 
 from __future__ import annotations
@@ -95,7 +98,7 @@ def measure(capture: Path, reference: Path, folder: Path, photographs: int, thre
 
 
 def row(name: str, measured: dict) -> dict:
-    """Return the scores of a capture with the present weights."""
+    """Return the scores of a capture with the current weights."""
     error, predicted = measured["error"], probability(measured["evidence"])
     return {
         "name": name,
@@ -133,7 +136,7 @@ def reliability(captures: list[dict]) -> list[dict]:
 
 
 def fit(captures: list[dict]) -> np.ndarray:
-    """Return (6,) weights of the logistic law with the largest likelihood. All captures have equal weight."""
+    """Return the (6,) weights of the logistic function with the largest likelihood. All captures have equal weight."""
     evidence = np.concatenate([each["evidence"] for each in captures]).astype(np.float64)
     right, weight = np.concatenate([each["error"] < RIGHT for each in captures]), _equal(captures)
     weights = np.zeros(evidence.shape[1])
@@ -145,7 +148,7 @@ def fit(captures: list[dict]) -> np.ndarray:
 
 
 def _equal(captures: list[dict]) -> np.ndarray:
-    """Return weights of the pixels, of sum 1, by which all captures have equal weight."""
+    """Return pixel weights with sum 1 that give all captures equal weight."""
     counts = [len(each["error"]) for each in captures]
     return np.concatenate([np.full(count, 1 / (count * len(captures))) for count in counts])
 
@@ -177,14 +180,20 @@ def report(captures: dict[str, dict], fitted: list[str]) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of planes and results")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for stereo planes and results"
+    )
     parser.add_argument("--data", nargs="+", type=Path, required=True, metavar="CAPTURE", help="folders of captures")
-    text = "their surfaces, in the same order (default: reference.ply in each)"
+    text = "reference meshes of the captures, in the same order (default: reference.ply in each)"
     parser.add_argument("--references", nargs="*", type=Path, default=[], metavar="MESH", help=text)
-    parser.add_argument("--fitted", nargs="*", default=[], metavar="NAME", help="captures that the law is fitted to")
-    parser.add_argument("--fit", action="store_true", help="print the weights that fit these")
-    parser.add_argument("--photographs", type=int, default=24, help="of each capture (default: %(default)s)")
-    parser.add_argument("--threads", type=int, default=0, help="0 uses every core (default: %(default)s)")
+    parser.add_argument(
+        "--fitted", nargs="*", default=[], metavar="NAME", help="captures to which the confidence is fitted"
+    )
+    parser.add_argument("--fit", action="store_true", help="print the weights that fit these captures")
+    parser.add_argument("--photographs", type=int, default=24, help="photographs per capture (default: %(default)s)")
+    parser.add_argument(
+        "--threads", type=int, default=0, help="number of threads; 0: one per core (default: %(default)s)"
+    )
     given = parser.parse_args(arguments)
     try:
         run(given)
@@ -195,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run the whole command."""
+    """Run the study."""
     references = given.references or [capture / "reference.ply" for capture in given.data]
     if len(references) != len(given.data):
         raise LinprimError(f"{len(references)} references go with {len(given.data)} captures, wanted one for each")

@@ -1,15 +1,16 @@
-"""What switching an effect on is worth: pairs of built-in scenes, one that calls for it and one that does not.
+"""Measures what each effect gains and costs, and whether `--effects auto` decides correctly, on pairs of built-in
+scenes: one that needs the effect and one that does not.
 
     python -m linprim_geo.eval.studies.effects -o runs/effects --size 128 --iterations 1200 --seeds 2 [--only exposure
     lens ...] [--scenes ...]
 
-For every effect the detector decides about the scenes of its pair; then they are trained with the effect on and off,
-everything else off. Then some scenes are trained as `--effects auto`, `none` and `all` would, and with all that
-photographs alone tell. `effects.md` has both tables: evidence and whether the decision is right, what the effect
-gains, whether that is more than the scatter of trainings with other seeds, and what it costs; PSNR of the second one
-also with the gain that suits each held-out photograph. Times are CPU seconds of the whole training on one thread.
-Depth errors are relative to the truth; the share of the pixels where the render has no surface counts as 100 %, so
-holes are no gain.
+For each effect, the detector decides about both scenes of its pair. Then they are trained with the effect on and off,
+with all other effects off. Some scenes are also trained with `--effects auto`, `none` and `all`, and with all effects
+except measured depth and normals. `effects.md` has a table for each part. The first has the evidence, whether the
+decision is right, the gain, whether it exceeds the scatter between seeds, and the cost. The second also has the PSNR
+after fitting a gain to each held-out render. Times are CPU seconds of the whole training on one thread. Depth errors
+are relative to the true depth. Pixels for which the render has no surface count as 100 %, so that holes do not lower
+the error.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from linprim_geo.training.train import train
 
 VIEWS, TEST_VIEWS, POINTS = 32, 8, 3000
 PLAIN = {"shape": "smooth", "shading": "shaded"}
-# By the name of a built-in scene: its settings in addition to PLAIN.
+# For each built-in scene: its settings in addition to PLAIN.
 SCENES = {
     "plain": {},
     "highlights": {"specular": 0.4},
@@ -58,7 +59,7 @@ SCENES = {
     "wires": {"shape": "wires", "shading": "shaded"},
     "tabletop": {"table": 2.5, "environment": 4, "noise": 2.0},
 }
-# By the name of an effect: the scenes that need it, those that do not, and the score by which it is judged.
+# For each effect: the scenes that need it, those that do not, and the score that judges it.
 PAIRS = {
     "view-dependence": (("highlights",), ("plain",), "psnr"),
     "exposure": (("exposure",), ("room",), "psnr"),
@@ -73,8 +74,8 @@ PAIRS = {
     "exact-rays": (("room",), ("telephoto",), "psnr"),
     "double": ((), ("plain",), "psnr"),
 }
-# The ways of choosing effects that are compared. Measured depth and normals are exact in built-in scenes, so one way is
-# all effects without them.
+# The compared choices of effects. Measured depth and normals are exact in built-in scenes, so one choice is all effects
+# without them.
 WAYS = {
     "auto": Choice("auto"),
     "none": Choice("none"),
@@ -133,7 +134,7 @@ def make_scene(folder: Path, name: str, size: Size) -> Path:
 
 
 def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple[SceneOptions, TrainOptions]) -> dict:
-    """Train, or read the result of an earlier call from the folder. Return PSNR, the same with gains
+    """Train, or read the result of an earlier call from the folder. Return PSNR, PSNR after fitting gains
     (`psnr_with_gains`), the depth error in percent (given a reference mesh or depth images) and CPU seconds."""
     run = folder / "runs" / f"{path.name}.{label}.{options[1].seed}"
     result = run / "effects_scores.json"
@@ -153,8 +154,8 @@ def trained(folder: Path, path: Path, label: str, choice: Choice, options: tuple
 
 
 def psnr_with_gains(run: Path) -> float:
-    """Return the mean PSNR of held-out views after scaling each render by the gain per channel that fits its photograph
-    best, as the exposure of a held-out photograph is unknown."""
+    """Return the mean PSNR of held-out views after multiplying each render by the gain per channel that fits its
+    photograph best, because the exposure of a held-out photograph is unknown."""
     opened = Run.open(run)
     background = np.asarray(opened.background, np.float64)
     scores = []
@@ -224,10 +225,11 @@ def mean(rows: list[dict], name: str) -> float:
 
 
 def scatter(trainings: list[list[dict]], name: str) -> float | None:
-    """Return the standard deviation of a score over trainings that differ only in the seed, from the median variance
-    over groups of such trainings; None if all groups have one training.
+    """Return the standard deviation of a score between trainings that differ only in the seed, from the median variance
+    of groups of such trainings; None if each group has a single training.
 
-    The variances are chi-squared over their k degrees of freedom; their median is their mean times (1 - 2 / 9k)^3.
+    The variances are chi-squared with k degrees of freedom divided by k; their median is their mean times (1 - 2 /
+    9k)^3.
     """
     variances = {}
     for rows in trainings:
@@ -277,7 +279,7 @@ def table(rows: list[dict], comparisons: list[dict], seeds: int) -> str:
     if rows and None not in spread.values():
         lines += [
             "",
-            "Gains in dB, and in % of depth, 100 where there is no surface; time with the effect by that without.",
+            "Gains in dB and in % of depth (100 where there is no surface). Time: with the effect divided by without.",
         ]
         lines[-1] += (
             f" {seeds} seeds; one training scatters by {spread['psnr']:.2f} dB and {spread['depth']:.3f} % "
@@ -298,8 +300,8 @@ def verdict(row: dict, spread: dict, seeds: int) -> str:
     """Return whether a decision is right by the score that judges the effect. A change counts if it is more than twice
     its standard error.
 
-    In a scene that does not need the effect, a gain in that score does not count if the other score loses as much, in
-    standard errors.
+    In a scene that does not need the effect, a gain does not count if the other score loses as much, in standard
+    errors.
     """
     if row["reason"] == "impossible":
         return "ruled out"
@@ -326,24 +328,26 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, metavar="PX")
     parser.add_argument("--iterations", type=int, default=1200, metavar="N")
     parser.add_argument("--primitives", type=int, default=2000, metavar="N")
-    parser.add_argument("--seeds", type=int, default=2, metavar="N", help="trainings of everything that is compared")
+    parser.add_argument(
+        "--seeds", type=int, default=2, metavar="N", help="number of seeds of each training (default 2)"
+    )
     parser.add_argument("--only", nargs="*", choices=tuple(PAIRS), default=tuple(PAIRS), metavar="EFFECT")
     parser.add_argument(
         "--scenes",
         nargs="*",
         choices=tuple(SCENES),
         default=AUTO_OR_ALL,
-        help="for auto against none and all",
+        help="built-in scenes on which choices of effects are compared",
     )
     parser.add_argument(
         "--ways",
         nargs="+",
         choices=tuple(WAYS),
         default=tuple(WAYS),
-        help="of choosing effects that are compared on these",
+        help="choices of effects to compare on these scenes",
     )
     parser.add_argument(
-        "--captures", nargs="*", default=[], metavar="DIR[:K]", help="captures for the same, downscaled by K"
+        "--captures", nargs="*", default=[], metavar="DIR[:K]", help="captures for the same comparison, downscaled by K"
     )
     parsed = parser.parse_args()
     folder, size, seeds = (

@@ -1,19 +1,20 @@
-"""What each thing that a photograph adds costs, one at a time and all together: `python -m
-linprim_geo.eval.studies.ladder -o runs/ladder`.
+"""Measures how each imperfection of real photographs affects the result, one at a time and all together.
 
-Built-in scenes are photographed, trained and meshed by default once per rung: ideal photographs, then each effect of a
-camera alone, errors of cameras, few photographs, points from photographs, and all of them, as by a phone. An object
-stands on a table in a room at infinity, without masks; the first rung of an object has masks and no room. What the
-effects are, with units and formulas, is in `synthetic.camera_effects`.
+    python -m linprim_geo.eval.studies.ladder -o runs/ladder
+
+Built-in scenes are rendered, trained and meshed with default options, once per rung: ideal photographs, each camera
+effect alone, pose and focal length errors, few photographs, points triangulated from photographs, and everything
+together, as with a phone. An object stands on a table in a room at infinity, without masks. The first rung of an object
+has masks and no room instead. `synthetic.camera_effects` defines the effects, with units and formulas.
 
 `ladder.json` and `ladder.md` hold per scene and rung
 
-    PSNR of held-out photographs; Chamfer distance in % of the diagonal, of what the cameras see, and divided by that of
-    ideal photographs; normal consistency; the share of the mesh that is farther than 1 % from the reference (floaters);
-    the true error divided by the predicted one, in the mean, and their rank correlation; CPU seconds of training and
+    PSNR of held-out photographs; Chamfer distance of the visible part in % of the diagonal, also divided by that of
+    ideal photographs; normal consistency; the share of the mesh that is more than 1 % from the reference (floaters);
+    the mean true error divided by the mean predicted error, and their rank correlation; CPU seconds of training and
     extraction.
 
-What the output folder holds already is not done again.
+Results in the output folder are reused.
 """
 
 from __future__ import annotations
@@ -32,9 +33,9 @@ from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 from linprim_geo.eval.studies.surfaces import score
 from linprim_geo.eval.study_tables import write_table
 
-# Numbers of photographs for training and for scores; rungs of few photographs change the first.
+# Numbers of training and held-out photographs; rungs with few photographs change the first.
 VIEWS, TEST_VIEWS, POINTS = 40, 6, 5000
-# A table three times as wide as the object in a room at infinity: near and distant background, without masks.
+# A table three times as wide as the object, in a room at infinity: near and far background, without masks.
 AROUND_OBJECT: dict[str, Any] = {"table": 3.0, "environment": 3, "path": "hemisphere"}
 SCENES: dict[str, dict[str, Any]] = {"cad": AROUND_OBJECT, "smooth": AROUND_OBJECT, "room": {}}
 IDEAL, MASKS = "ideal", "masks, no background"
@@ -84,8 +85,8 @@ class Size:
 
 
 def settings_of(scene: str, rung: str) -> dict[str, Any] | None:
-    """Return the settings of `synth` for a scene on a rung; None if the scene has no such rung, such as masks in a
-    room."""
+    """Return the settings of `synth` for a scene and a rung; None if the scene does not have that rung, such as masks
+    in a room."""
     if rung == MASKS:
         return {} if SCENES[scene] else None
     return SCENES[scene] | RUNGS[rung]
@@ -138,7 +139,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES), help="default: all")
     parser.add_argument("--rungs", nargs="+", choices=list(RUNGS), default=list(RUNGS), help="default: all")
-    parser.add_argument("--size", type=int, default=240, help="pixels of a side (default: %(default)s)")
+    parser.add_argument("--size", type=int, default=240, help="image side in pixels (default: %(default)s)")
     parser.add_argument("--iterations", type=int, default=2000, help="default: %(default)s")
     parser.add_argument("--max-primitives", type=int, default=5000, help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
@@ -152,7 +153,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run the whole command."""
+    """Run the study."""
     size, rows = Size(given.size, given.iterations, given.max_primitives, given.seed), []
     for scene in given.scenes:
         for rung in given.rungs:

@@ -1,10 +1,10 @@
-"""Trains and scores every capture found in a folder and prints one table: the public captures of docs/results.md.
+"""Trains, meshes and scores every capture in a folder and prints one table, such as that of the public captures.
 
     python -m linprim_geo.eval.studies.real_data --data DIR -o runs/real
 
-A capture is any sub-folder that `load_scene` reads. Its reference mesh is `reference.ply` or ScanNet++'s mesh in it, or
-`DIR/meshes/NAME.*` where NAME is the beginning of the folder's name. Depth is scored if the held-out views have depth
-maps.
+A capture is any sub-folder that `load_scene` can read. Its reference mesh is `reference.ply` or ScanNet++'s mesh inside
+it, or `DIR/meshes/NAME.*`, where NAME is the beginning of the folder's name. Depth is scored if the held-out views have
+depth maps. docs/results.md has the table.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def reference_of(capture: Path, data: Path) -> Path | None:
 
 
 def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
-    """Train, mesh and score one capture; every key of the result is a column of the table or a file."""
+    """Train, mesh and score one capture; each key of the result is a column of the table or a file."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.eval.depth import eval_depth_run
     from linprim_geo.eval.images import eval_images_run
@@ -111,7 +111,7 @@ def run_capture(capture: Path, data: Path, output: Path, options: TrainOptions, 
 
 
 def tried(capture: Path, data: Path, output: Path, options: TrainOptions, scene_options: SceneOptions) -> dict:
-    """Return the row of a capture, or its `error`, so that the other captures are still processed."""
+    """Return the row of a capture, or its `error`, so that a failure does not stop the other captures."""
     try:
         return run_capture(capture, data, output, options, scene_options)
     except LinprimError as error:
@@ -128,7 +128,7 @@ def capture_task(folder: Path, capture: str, data: str, output: str, options: di
 def by_workers(
     found: list[Path], args: argparse.Namespace, options: TrainOptions, scene_options: SceneOptions
 ) -> list[dict]:
-    """Return the rows of all captures, several processed at a time."""
+    """Return the rows of all captures, processed in parallel by workers."""
     args.output.mkdir(parents=True, exist_ok=True)
     given = {"data": str(args.data.resolve()), "output": str(args.output.resolve()), "options": asdict(options)}
     given |= {"scene_options": asdict(scene_options)}
@@ -143,7 +143,7 @@ def by_workers(
 
 
 def table(rows: list[dict]) -> str:
-    """Return the rows as a Markdown table; scores without ground truth are dashes."""
+    """Return the rows as a Markdown table; scores that need a missing ground truth are dashes."""
     columns = [
         ("capture", "name", "{}"),
         ("views", "views", "{}"),
@@ -164,7 +164,7 @@ def table(rows: list[dict]) -> str:
 
 
 def curves(rows: list[dict]) -> str:
-    """Return one line per capture: held-out PSNR over seconds of training (during it, of a part of the held-out
+    """Return one line per capture: PSNR of held-out views over seconds of training (during training, of some of these
     views)."""
     return "\n".join(
         f"* {row['name']}: " + ", ".join(f"{psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in row["curve"])
@@ -174,7 +174,7 @@ def curves(rows: list[dict]) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="a capture, or a folder of captures")
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="capture, or folder of captures")
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="only these captures")
     parser.add_argument("-o", "--output", type=Path, default=Path("runs/real"), metavar="DIR")
     parser.add_argument("--iterations", type=int, default=TrainOptions.iterations)
@@ -183,9 +183,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--samples", type=int, default=TrainOptions.samples)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--evaluate-every", type=int, default=TrainOptions.evaluate_every)
-    text = "do so many captures at once, each by a worker on one core; 0: one per core (default: 1, on all cores)"
+    text = "process N captures in parallel, each by a worker on one core; 0: one per core (default: 1, on all cores)"
     parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
-    parser.add_argument("--cluster", metavar="local|ADDRESS", help="on Ray, as of linprim-geo train")
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="use Ray, see linprim-geo train")
     args = parser.parse_args(arguments)
     options = TrainOptions(
         iterations=args.iterations,

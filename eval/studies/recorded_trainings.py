@@ -1,17 +1,17 @@
-"""Three trainings whose results are kept, so that a test can tell when one comes out otherwise than it used to.
+"""Records the results of three trainings, so that a test can detect when one of them changes.
 
     python -m linprim_geo.eval.studies.recorded_trainings -o tests/training/recorded_trainings.json --seeds 0 1 2 3
 
-photographs the built-in part, smooth body and room (40 views of 160x160, the exposure of part and room drifting),
-trains each by what `--effects auto` decides, extracts its mesh, and adds a row for each seed and the instruction set in
-use (LINPRIM_GEO_ISA). A row takes the place of an older one of the same scene, seed and instruction set.
+The built-in part, smooth body and room are rendered (40 views of 160x160 pixels, with drifting exposure for part and
+room), trained with `--effects auto` and meshed. One row is added for each scene, seed and the instruction set in use
+(LINPRIM_GEO_ISA); it replaces an older row of the same scene, seed and instruction set.
 
-A row holds what was decided about effects, the PSNR in dB of the held-out photographs, of the part of the mesh that
-cameras see the Chamfer distance in % of the reference's diagonal and the mean angle of normals in degrees, and CPU
-seconds of a training step over those that the core's limits give its (pixel, primitive) pairs (`ops.machine_limits`,
+A row holds the decisions about effects; the PSNR of held-out photographs in dB; for the part of the mesh that cameras
+see, the Chamfer distance in % of the reference's diagonal and the mean normal angle in degrees; and the CPU seconds of
+a training step, divided by the time that the core's limits give for its (pixel, primitive) pairs (`ops.machine_limits`,
 measured between the steps).
 
-Seeds and instruction sets scatter the results; `band` says where one more is to be expected.
+Results vary between seeds and instruction sets; `band` returns the interval in which another result is expected.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from linprim_geo.base.files import read_json, write_json
 from linprim_geo.base.options import ExtractOptions, SceneOptions, TrainOptions
 
 DRIFT = {"cad": 0.2, "smooth": 0.0, "room": 0.2}
-"""The scenes, and the exposure drift of each, see `SynthOptions.exposure_drift`."""
+"""The scenes, with the exposure drift of each (`SynthOptions.exposure_drift`)."""
 
 OPTIONS = TrainOptions(iterations=1500, max_primitives=2000, sh_degree=1, threads=1, evaluate_every=0)
 
 TIMED_FROM, TIMED_EVERY = 1300, 5
-"""The first timed step, and the interval of timed steps."""
+"""The first timed step, and the interval between timed steps."""
 
 SAMPLES = 50_000
 """Sample points per surface. The standard error of a Chamfer distance is then about 0.4 % of it."""
 
 FALSE_ALARMS = 1e-3
-"""Probability that an unchanged training has a result outside its band."""
+"""Probability that the result of an unchanged training is outside of its band."""
 
 
 def measure(scene: str, seed: int, folder: Path) -> dict:
@@ -108,14 +108,14 @@ class StepTiming:
             self.ratios.append(1e9 * seconds / (pairs * (limits["pair_forward_ns"] + limits["pair_backward_ns"])))
 
     def over_limit(self) -> float:
-        """Return the CPU seconds of a step divided by the seconds that the core's limits imply for its pairs: the 10 %
-        quantile over steps, as other work on the machine slows down most of them."""
+        """Return the CPU seconds of a step, divided by the seconds that the core's limits give for its pairs: the 10 %
+        quantile over steps, because other work on the machine slows down most of them."""
         return float(np.quantile(self.ratios, 0.1))
 
 
 def band(values: Sequence[float]) -> tuple[float, float]:
-    """Return the prediction interval of Student's t: another value of the same normal distribution is outside of it
-    with probability FALSE_ALARMS. Needs at least three values."""
+    """Return the prediction interval of Student's t distribution: another value from the same normal distribution is
+    outside of it with probability FALSE_ALARMS. Needs at least three values."""
     from scipy.stats import t
 
     if len(values) < 3:
@@ -126,8 +126,8 @@ def band(values: Sequence[float]) -> tuple[float, float]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="JSON, made or added to")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="default: 0")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="JSON file to write or extend")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="N", help="random seeds (default: 0)")
     parser.add_argument("--scenes", nargs="+", choices=DRIFT, default=list(DRIFT), help="default: all")
     given = parser.parse_args(arguments)
     try:

@@ -1,15 +1,16 @@
-"""What larger captures cost: a block's processor time and memory over photographs, pixels and primitives, measured,
-fitted, and predicted for 10^4 and 10^6 photographs. `python -m linprim_geo.eval.studies.scaling -o runs/scaling [--run
-RUN_IN_BLOCKS]`.
+"""Predicts the cost of large captures: measures processor time and memory of a block over numbers of photographs,
+pixels and primitives, fits formulas, and evaluates them for 10^4 and 10^6 photographs.
 
-Measured are trainings in workers of their own, on a street. The fit is
+    python -m linprim_geo.eval.studies.scaling -o runs/scaling [--run RUN_IN_BLOCKS]
+
+The measurements are trainings of a street, each in a worker process. The formulas are
 
     setup seconds   = s0 + s1 photos + s2 photos pixels          GiB = m0 + m1 photos pixels + m2 pixels + m3 primitives
     seconds a step  = t0 + t1 pixels + t2 primitives             filling up points, seconds = f0 + f1 photos
 
-with no negative number, by relative errors; it is checked on the largest size, which it has not seen. Processor time,
-not the clock's, is measured, so a machine that does other work beside is no matter. A prediction also takes what a run
-in blocks shows (--run): in how many blocks a photograph is used, and which part of it.
+with non-negative coefficients, fitted by relative errors. The fit is checked on the largest size, which it does not
+include. Processor time is measured instead of wall time, so that other load on the machine does not matter. A
+prediction also uses two numbers of a run in blocks (--run): how many blocks use a photograph, and which share of it.
 """
 
 from __future__ import annotations
@@ -69,12 +70,12 @@ class Fit:
     filling: tuple[float, float]
 
     def seconds_of_filling(self, photos: float) -> float:
-        """Return the processor seconds of filling up the points before the first task of a block; constant from
-        MOST_VIEWS views on."""
+        """Return the processor seconds of filling up points before the first task of a block; constant from MOST_VIEWS
+        views on."""
         return float(np.dot(self.filling, _filling_terms(photos)))
 
     def seconds_of_setup(self, photos: float, pixels: float) -> float:
-        """Return the processor seconds before the first step, without filling up points."""
+        """Return the processor seconds before the first step, except for filling up points."""
         return float(np.dot(self.setup, _setup_terms(photos, pixels)))
 
     def seconds_of_step(self, pixels: float, primitives: float) -> float:
@@ -131,7 +132,8 @@ def check(found: Fit, row: dict) -> dict:
 
 
 def predict(found: Fit, photos: float, capture: Capture) -> dict:
-    """Return core-hours, memory of a worker, storage and network traffic for a capture of so many photographs."""
+    """Return core-hours, memory per worker, storage and network traffic for a capture with this number of
+    photographs."""
     from linprim_geo.training.blocks.driver import OVERLAP
     from linprim_geo.training.blocks.plan import (
         COARSE_DOWNSCALE,
@@ -189,7 +191,7 @@ def predict(found: Fit, photos: float, capture: Capture) -> dict:
 
 
 def shown_in_blocks(run: Path) -> tuple[float, float]:
-    """Return (number of blocks that use a photograph, share of its pixels that one of them uses), for a run in
+    """Return (number of blocks that use a photograph, share of its pixels that each of them uses) for a run in
     blocks."""
     from linprim_geo.runs.run import Run
     from linprim_geo.training.blocks.plan import read_plan
@@ -201,7 +203,7 @@ def shown_in_blocks(run: Path) -> tuple[float, float]:
 
 
 def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitives: int, steps: int) -> dict:
-    """Measure processor seconds of the setup and of a step of a training that stores photographs as a block does."""
+    """Measure the processor seconds of setup and of a step for a training that stores photographs like a block."""
     import torch
 
     from linprim_geo.capture.load import load_scene
@@ -249,7 +251,7 @@ def measure_task(folder: Path, scene: str, photos: int, downscale: int, primitiv
 
 
 def table(fitted: Fit, checked: dict, predictions: list[dict], capture: Capture) -> str:
-    """Return the fit, its check, the predictions and their assumptions, as Markdown."""
+    """Return the fit, its check, the predictions and their assumptions as Markdown."""
     lines = [
         "| photographs | blocks | primitives | core-hours | longest task, h | GiB per worker | storage, GiB | "
         "network, GiB |",
@@ -290,7 +292,7 @@ def table(fitted: Fit, checked: dict, predictions: list[dict], capture: Capture)
 
 
 def run(given: argparse.Namespace) -> dict:
-    """Run the missing measurements, fit, predict, and write the table."""
+    """Run the missing measurements, fit, predict and write the table."""
     from linprim_geo.base.progress import Progress
     from linprim_geo.eval.studies.street import street
     from linprim_geo.jobs.executor import Task
@@ -344,14 +346,21 @@ def run(given: argparse.Namespace) -> dict:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the capture and results"
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the capture and the results"
     )
     parser.add_argument(
-        "--run", type=Path, metavar="RUN", help="a run in blocks, for how they share photographs (default: assumed)"
+        "--run",
+        type=Path,
+        metavar="RUN",
+        help="run in blocks from which to take how blocks share photographs (default: assumed)",
     )
-    parser.add_argument("--steps", type=int, default=STEPS, help="timed per size (default: %(default)s)")
-    parser.add_argument("--cluster", metavar="local|ADDRESS", help="as of train")
-    parser.add_argument("--workers", type=int, default=1, help="at once (default: %(default)s)")
+    parser.add_argument(
+        "--steps", type=int, default=STEPS, help="number of timed steps per size (default: %(default)s)"
+    )
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="use Ray, see linprim-geo train")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="largest number of workers at a time (default: %(default)s)"
+    )
     given = parser.parse_args(arguments)
     given.sizes, given.views, given.side = SIZES, VIEWS, SIDE
     try:

@@ -1,4 +1,5 @@
-"""A street of any length, for captures of any size: a hall with facades, doors, windows, carts, trees and boxes."""
+"""A procedural street of any length, for captures of any size: a hall with facades, doors, windows, carts, trees and
+boxes."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ PALETTE = (
 
 
 def street(houses: int, seed: int = 11) -> TexturedMesh:
-    """Return the air of a street with so many houses on either side: one closed surface, with faces towards the inside.
-    Units are metres; x is along the street, z up."""
+    """Return a street with this many houses on either side, as one closed surface with faces towards the inside. Units
+    are metres; x is along the street, z up."""
     from manifold3d import Manifold
 
     tags, rng = Tags(), np.random.default_rng(seed)

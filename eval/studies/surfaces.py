@@ -1,23 +1,24 @@
-"""Every way to take a surface, on every built-in scene, against the exact mesh: `python -m
-linprim_geo.eval.studies.surfaces -o runs/surfaces`.
+"""Scores every extraction method on every built-in scene against the exact mesh.
 
-Each scene is photographed, trained once with octahedra and once with Gaussians (the baseline), and each training meshed
-by every method that it allows; `--data` adds captures, scored against their `--references`. `--stereo auto off` does
-everything a second time without stereo: training starts at the capture's points alone, nothing holds it to stereo's
-surfaces, and depth maps are the rendered ones. `--true-depth` adds what the same fusion makes of exact depth maps of
-the reference, without training: the best that depth can give. `surfaces.json` and `surfaces.md` hold per mesh, of what
-the cameras see unless it says whole:
+    python -m linprim_geo.eval.studies.surfaces -o runs/surfaces
+
+Each scene is rendered and trained once with octahedra and once with Gaussians (the baseline). Each training is meshed
+by every method that works for it. `--data` adds captures, scored against their `--references`. `--stereo auto off`
+repeats everything without stereo: training then starts at the capture's points alone, without the loss on stereo
+depths, and only rendered depth maps are fused. `--true-depth` also fuses exact depth maps of the reference without
+training, which shows the best result that depth maps can give. `surfaces.json` and `surfaces.md` hold per mesh, of the
+visible part unless stated otherwise:
 
     PSNR of held-out photographs; share of the pixels with a depth image at which the mesh is within 1 % of it, from the
     poses of the run;
 
     Chamfer distance in % of the reference's diagonal (point to surface, both ways), the median distance of the mesh
-    from the reference, and the Chamfer distance of the whole mesh; F1 at 1 %; normal consistency; faces, boundary
-    edges, what manifold3d says of closed meshes; the rank correlation of `quality` with the exact distance of vertices,
-    and the ratio of their means; seconds and peak memory of the extraction; CPU seconds of training (none where it was
-    resumed) and extraction.
+    from the reference, and the Chamfer distance of the whole mesh; F1 at 1 %; normal consistency; faces; boundary
+    edges; the verdict of manifold3d on closed meshes; the rank correlation of `quality` with the exact distance of
+    vertices, and the ratio of their means; seconds and peak memory of the extraction; CPU seconds of training (none
+    if it was resumed) and of extraction.
 
-What the output folder holds already is not done again.
+Results in the output folder are reused.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ COLUMNS = {
 
 
 def score(run: Path, reference: Path, method: str, options: ExtractOptions, target: Path) -> dict:
-    """Extract one mesh to `target` and return its row; `reference` may be NO_REFERENCE."""
+    """Extract a mesh to `target` and return its row; `reference` may be NO_REFERENCE."""
     from linprim_geo.surface.extract import extract_mesh
 
     began = time.process_time()
@@ -104,7 +105,7 @@ def score(run: Path, reference: Path, method: str, options: ExtractOptions, targ
 
 
 def _photographs(run: Path, visible: Path) -> dict:
-    """Score a run against held-out photographs, and its mesh against the depth images of the capture."""
+    """Score the run against held-out photographs, and the mesh against the depth images of the capture."""
     from linprim_geo.eval.images import eval_images_run
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.runs.run import Run
@@ -117,8 +118,8 @@ def _photographs(run: Path, visible: Path) -> dict:
 
 
 def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
-    """Return the share of the pixels of depth images at which a mesh is within RIGHT_DEPTH of the depth; None without
-    depth images."""
+    """Return the share of the pixels with a depth image at which the mesh is within RIGHT_DEPTH of that depth; None
+    without depth images."""
     from linprim_geo.geometry.raycast import RayCaster
 
     caster, right, known = RayCaster(mesh.vertices, mesh.faces), 0, 0
@@ -133,8 +134,8 @@ def depth_right(mesh: Mesh, views: Sequence[View]) -> float | None:
 
 
 def score_true_depth(capture: Path, reference: Path, options: SceneOptions, target: Path) -> dict:
-    """Fuse exact depth maps of the training cameras to `target`, as `extract-mesh --method tsdf` fuses rendered ones;
-    return the row."""
+    """Fuse exact depth maps of the training cameras to `target`, as `extract-mesh --method tsdf` fuses rendered ones,
+    and return the row."""
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh, save_mesh
     from linprim_geo.geometry.raycast import RayCaster
@@ -159,7 +160,7 @@ def score_true_depth(capture: Path, reference: Path, options: SceneOptions, targ
 
 
 def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
-    """Score the mesh of a run against the reference, and the predicted errors of the part that cameras see."""
+    """Score the mesh of a run against the reference, and its predicted errors in the part that cameras see."""
     from scipy.stats import spearmanr
 
     from linprim_geo.eval.surface_samples import SurfaceDistance
@@ -178,7 +179,7 @@ def _distances(run: Path, reference: Path, target: Path, visible: Path) -> dict:
 
 
 def _against(mesh: Mesh, truth: Mesh, cameras: Sequence[Camera]) -> dict:
-    """Score a mesh against the reference: the part that cameras see, except for scores of the whole mesh."""
+    """Score a mesh against the reference: the visible part, except for scores of the whole mesh."""
     from linprim_geo.eval.mesh import score_mesh
 
     whole = score_mesh(mesh, truth, samples=SAMPLES, cameras=cameras)
@@ -211,7 +212,7 @@ def table(rows: list[dict]) -> str:
 
 
 def _saved(target: Path, measure: Callable[[], dict]) -> dict:
-    """Return the row of a mesh: the one saved beside it, or else a new measurement."""
+    """Return the row of a mesh: the one saved next to it, or a new measurement."""
     saved = target.with_suffix(".json")
     if not saved.exists():
         write_json(saved, measure())
@@ -234,7 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--scenes", nargs="*", choices=BUILT_IN, default=list(BUILT_IN), help="built-in scenes (default: all)"
     )
     parser.add_argument(
-        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of further captures"
+        "--data", nargs="*", type=Path, default=[], metavar="CAPTURE", help="folders of captures to add"
     )
     parser.add_argument(
         "--references",
@@ -242,26 +243,30 @@ def main(arguments: list[str] | None = None) -> int:
         type=Path,
         default=[],
         metavar="MESH",
-        help="their surfaces, in the same order; none for one without",
+        help="reference meshes of these captures, in the same order; none: no reference",
     )
     parser.add_argument("--primitives", nargs="+", choices=list(METHODS), default=list(METHODS), help="default: all")
     parser.add_argument(
         "--methods", nargs="+", choices=METHODS["octahedron"], default=METHODS["octahedron"], help="default: all"
     )
     parser.add_argument(
-        "--stereo", nargs="+", choices=STEREO, default=["auto"], help="with it, without (default: with)"
+        "--stereo", nargs="+", choices=STEREO, default=["auto"], help="auto: with stereo (default); off: without"
     )
-    parser.add_argument("--true-depth", action="store_true", help="fuse exact depth maps of the references, too")
+    parser.add_argument("--true-depth", action="store_true", help="also fuse exact depth maps of the references")
     parser.add_argument(
         "--refine",
         type=rounds,
         default=ExtractOptions.refine,
-        help="rounds or auto, see extract-mesh (default: %(default)s)",
+        help="rounds of refinement, or auto; see extract-mesh (default: %(default)s)",
     )
-    parser.add_argument("--size", type=int, default=320, help="pixels of the built-in scenes (default: %(default)s)")
+    parser.add_argument(
+        "--size", type=int, default=320, help="image side of the built-in scenes, in pixels (default: %(default)s)"
+    )
     parser.add_argument("--iterations", type=int, default=7000, help="default: %(default)s")
     parser.add_argument("--max-primitives", type=int, default=5000, help="default: %(default)s")
-    parser.add_argument("--downscale", type=int, default=1, help="of the captures (default: %(default)s)")
+    parser.add_argument(
+        "--downscale", type=int, default=1, help="average K by K pixels of the captures (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     given = parser.parse_args(arguments)
     try:
@@ -273,7 +278,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(given: argparse.Namespace) -> None:
-    """Run the whole command."""
+    """Run the study."""
     from linprim_geo.synthetic.synth import synthesize
     from linprim_geo.training.train import train
 
