@@ -1,4 +1,4 @@
-"""Registration of a mesh to a reference in another frame, before it is scored."""
+"""Registers a mesh to a reference in another frame before it is scored."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from linprim_geo.geometry.mesh import Mesh, face_normals
 
 # Points sampled on each side: in the search over starts, and in the final registration.
 FEW, MANY = 1000, 20_000
-# Share of the points of each side that are used, those with the smallest distances. It leaves out parts that only one
-# side has.
+# Share of the points of each side that are used: those with the smallest distances. Parts that only one side has are
+# thereby ignored.
 KEPT = 0.9
 # Largest numbers of steps, of the final registration and of the search over starts; and the size of a step, as a share
 # of the reference's size, below which the iteration ends.
@@ -51,14 +51,14 @@ def align(prediction: Mesh, reference: Mesh | np.ndarray, way: str, seed: int = 
     """Register a clean mesh to a clean mesh or to (P, 3) points.
 
     "icp" finds rotation and translation, starting from the mesh's pose. "similarity" also finds the scale, and starts
-    from 24 alignments of the principal axes as well, so the two frames may be unrelated. Both are iterative
-    closest-point methods with Gauss-Newton steps on point-to-plane distances along the mesh's normals, in both
-    directions, of which the smallest share KEPT is used (Chen and Medioni, Object modelling by registration of multiple
-    range images, 1992).
+    from 24 alignments of the principal axes as well, so that the two frames may be unrelated. Both are iterative
+    closest-point methods. They make Gauss-Newton steps on point-to-plane distances along the mesh's normals, in both
+    directions, and use the share KEPT of the pairs, those with the smallest distances (Chen and Medioni, Object
+    modelling by registration of multiple range images, 1992).
 
     Returns: the transform, and a dict with `way`, `scale`, `turned_degrees`, `moved` (distance of the centre of the
-        mesh's bounding box), `matrix` (4 rows), `distance_before` and `distance_after` (mean over the points used),
-        `starts` and `steps`.
+    mesh's bounding box), `matrix` (4 rows), `distance_before` and `distance_after` (mean over the points used),
+    `starts` and `steps`.
     """
     pair = _Pair(prediction, reference, seed)
     still = Motion(1.0, np.eye(3), np.zeros(3))
@@ -69,7 +69,7 @@ def align(prediction: Mesh, reference: Mesh | np.ndarray, way: str, seed: int = 
         begin = min(rough, key=lambda found: found[1])[0]
     motion, after, steps = pair.settled(begin, MANY, STEPS, scaled=way == "similarity")
     before = pair.step(still, MANY, False)[1]
-    if after > before:  # the registration has improved nothing
+    if after > before:  # the registration is no improvement
         motion, after = still, before
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = motion.scale * motion.rotation, motion.offset

@@ -23,15 +23,15 @@ def count_views(
     enough: int = 1,
     faces: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Count the cameras that see each point: it projects into the image, lies in front of the camera, and no face hides
-    it.
+    """Count the cameras that see each point: the point projects into the image, is in front of the camera, and is not
+    occluded by a face.
 
     Args:
-        caster: of the mesh that can hide the points.
+        caster: of the mesh that can occlude the points.
         points: (P, 3), in the frame of the cameras.
-        slack: length; a face at most this far in front of a point does not hide it.
-        enough: count at which a point needs no further cameras.
-        faces: (P,) face of the caster's mesh that each point lies on; it does not hide the point.
+        slack: length; a face at most this far in front of a point does not occlude it.
+        enough: counting stops at this number of cameras.
+        faces: (P,) face of the caster's mesh on which each point lies; it does not occlude the point.
 
     Returns:
         (P,) int64, at most `enough`.

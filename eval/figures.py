@@ -15,8 +15,8 @@ from linprim_geo.geometry.ply import color_columns, write_ply, xyz_columns
 from linprim_geo.imaging import plots
 from linprim_geo.imaging.colors import error_colors
 
-# Longest edge of error-coloured meshes, as a share of the diagonal. Longer ones are subdivided, as a wall of two
-# triangles would show the errors of its corners only.
+# Longest edge of error-coloured meshes, as a share of the diagonal. Longer edges are subdivided, because a wall of two
+# triangles would only show the errors at its corners.
 COLOR_EDGE_SHARE = 1 / 150
 
 HISTOGRAM_QUANTILE = 99.0  # percentile of the distances, the larger of both directions, at which the axis ends
@@ -89,7 +89,7 @@ def plot_histogram(path: Path, forward: Comparison, backward: Comparison, tau: f
     """
     kept = [side.distance[side.keep] for side in (forward, backward)]
     end = max((float(np.percentile(d, HISTOGRAM_QUANTILE)) for d in kept if len(d)), default=0.0)
-    # The distances of coincident surfaces are rounding errors only. The axis then ends at the threshold.
+    # Distances between coincident surfaces are rounding errors only; the axis then ends at the threshold.
     end = end if end > 1e-9 * tau else tau
     names = ("prediction to reference", "reference to prediction")
     plots.histogram(path, dict(zip(names, kept, strict=True)), end, tau, title, unit)

@@ -110,7 +110,7 @@ def eval_images_run(
 
 
 def _distances(views, weights: str | os.PathLike | None) -> tuple[list, str]:
-    """Return the networks that compute LPIPS of these views, and a sentence on why there are none.
+    """Return the networks that compute LPIPS of these views, and if there are none a sentence with the reason.
 
     Raises:
         LinprimError: `weights` is given, and cannot be used or needs larger images.

@@ -33,9 +33,11 @@ DEFAULT_TAU_SHARE = 0.01  # of the reference's diagonal
 # Distance in front of a sample, in diagonals of its mesh, within which another face does not occlude it: sixteen times
 # the single-precision error of Embree in a centred scene.
 OCCLUSION_TOLERANCE = 1e-5
-# The samples on creases are this many times fewer than those of the surface.
+# Ratio of the number of samples on the surface to that on creases.
 CREASE_PART = 10
-HAUSDORFF_WARNING = "largest sampled distance: a lower bound of the Hausdorff distance, and one stray face decides it"
+HAUSDORFF_WARNING = (
+    "largest sampled distance: a lower bound of the Hausdorff distance, which a single stray face can determine"
+)
 
 
 def score_mesh(
@@ -111,8 +113,8 @@ def _score_headline(
     results |= {"samples_reference": samples}
     results |= {"kept_prediction": float(forward.keep.mean()), "kept_reference": float(backward.keep.mean())}
     results["sampling"] = f"{samples} uniform points per surface, one in each equal share; point to triangle"
-    culling = "none" if box is None else "what lies in the box"
-    results["culling"] = culling if cameras is None else f"{culling}; under visible, what the cameras see"
+    culling = "none" if box is None else "samples in the box"
+    results["culling"] = culling if cameras is None else f"{culling}; scores in visible: samples that a camera sees"
     results |= reduce_scores(forward, backward, tau, oriented=oriented)
     results["hausdorff_warning"] = HAUSDORFF_WARNING
     shape = ShapeComparison.of(prediction, reference, forward, backward, tau, samples // CREASE_PART, seed)
@@ -136,7 +138,7 @@ def _score_headline(
         visible |= reduce_scores(*sides, tau, oriented=oriented)
         visible["shape"] = shape.scores((keep_prediction, keep_reference), on_creases, diagonal)
         results["visible"] = with_percent(visible, diagonal)
-        if box is None:  # rays start outside of a box
+        if box is None:  # rays would start outside of the box
             rays = compare_along_rays(prediction, reference, cameras, rays=samples, tau=tau, seed=seed)
             results["rays"] = with_percent(rays, diagonal)
     results = with_percent(results, diagonal)

@@ -1,4 +1,4 @@
-"""Images of a mesh from a run's cameras, with its texture or vertex colours, as a viewer would show them."""
+"""Renders images of a mesh from a run's cameras, with its texture or vertex colours, like a viewer."""
 
 from __future__ import annotations
 

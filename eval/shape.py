@@ -1,7 +1,8 @@
 """Shape scores that distances do not cover: normals, creases, flat parts, and the quality of triangles.
 
-Two surfaces at a small distance may be shaded quite differently. Normals are compared by angle, near the creases of the
-reference and elsewhere; creases of both are compared; and the prediction's flatness on the reference's planes measured.
+Two surfaces that are close to each other may still look different when shaded. Normals are therefore compared by angle,
+near the creases of the reference and elsewhere. Creases of both meshes are compared, and the flatness of the prediction
+on the planes of the reference is measured.
 """
 
 from __future__ import annotations
@@ -108,9 +109,9 @@ class ShapeComparison:
     """The input of `scores` for two surfaces.
 
     `near`: for each direction (P,) bool, samples near a crease of the reference. `creases`: for each direction (Q, 3)
-    points on the creases of one mesh, and (Q,) their distances to those of the other. `rows`: indices of the
-    reference's samples that lie on planes, off creases, and within tau of the prediction; `plane`: the number of each
-    one's plane; `height`: that of the prediction above it.
+    points on the creases of one mesh, and (Q,) their distances to the creases of the other. `rows`: indices of the
+    samples of the reference that lie on planes, away from creases, and within tau of the prediction; `plane`: the
+    number of the plane of each; `height`: the height of the prediction above it.
     """
 
     forward: Comparison

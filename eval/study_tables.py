@@ -1,4 +1,4 @@
-"""Writes the tables of studies, with a first line on the command, the machine and the date."""
+"""Writes the tables of studies, with a first line that names the command, the machine and the date."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from linprim_geo.base.files import atomic_write
 
 def write_table(path: Path, text: str) -> str:
     """Write a text below a line with the command of this process, the processor, its number of cores and the date.
-    Return the whole, without the final newline."""
+    Return the whole text without the final newline."""
     command = shlex.join(["python", *sys.orig_argv[1:]])
     head = f"Made by `{command}` on {processor()}, {usable_cores()} cores, {date.today().isoformat()}."
     whole = f"{head}\n\n{text.rstrip()}"

@@ -10,8 +10,7 @@ import numpy as np
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_normals
 
 QUANTILES = (50, 90, 95)
-# Queries in the order of a Morton curve visit nearby nodes of the tree, which are then in the cache: queries are 4x
-# faster.
+# Queries in Morton order visit nearby nodes of the tree, which are then in the cache. This makes them 4 times as fast.
 MORTON_BITS = 16
 NAN = float("nan")
 

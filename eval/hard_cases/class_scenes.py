@@ -1,4 +1,5 @@
-"""Building blocks for scenes of the hard classes: poses, extents, inner points, and scenes with a ray aimed at one."""
+"""Building blocks for scenes of the hard classes: poses, extents, interior points, and scenes with a ray that is aimed
+at one."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Seeded generators of hard cases for the rasterizer: batches of tiny scenes, in named classes by what makes them hard.
+"""Seeded generators of hard cases for the rasterizer: batches of tiny scenes, grouped in classes by the kind of
+difficulty.
 
-A scene is a camera with an image of a few pixels and one or a few primitives. One of its rays is aimed at a point
-inside the first primitive. Densities are chosen such that this ray neither misses nor is opaque, unless the class is
-about that. All numbers are rounded to float32 and held in float64, so that every variant of the accuracy ladder and the
-reference (`linprim_geo.eval.hard_cases.many_scenes`) get the same input.
+A scene is a camera with an image of a few pixels and one or a few primitives. One ray is aimed at a point inside the
+first primitive. Densities are chosen such that this ray neither misses nor is opaque, unless the class is about that.
+All numbers are rounded to float32 and stored as float64, so that every variant of the kernels and the reference
+(`linprim_geo.eval.hard_cases.many_scenes`) get the same input.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from linprim_geo.kernels.reference.rasterize import rotation_matrix
 class HardClass:
     """One class of hard cases: `make(rng, primitive, ray_model, count)` returns `count` scenes.
 
-    `value`: whether images and gradients are compared with the reference; if not, they are only checked for NaN,
+    `value`: whether images and gradients are compared with the reference; otherwise they are only checked for NaN,
     infinity and an opacity outside [0, 1]. `ties`: whether rays meet edges and vertices, where every one-sided gradient
-    is right.
+    is correct.
     """
 
     name: str
@@ -66,14 +67,14 @@ def hard_class(name: str, **options):
 
 @hard_class("ordinary")
 def ordinary(rng, primitive, ray_model, count):
-    """One primitive of half-axes 0.2 to 2 in front of the camera: what the others are compared with."""
+    """One primitive with half-axes 0.2 to 2 in front of the camera, for comparison with the other classes."""
     extent = random_extents(rng, primitive, count)
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent)
 
 
 @hard_class("several")
 def several(rng, primitive, ray_model, count):
-    """Five that overlap."""
+    """Five primitives that overlap."""
     extent = random_extents(rng, primitive, count, 5, -0.3, 0.3)
     return build(
         rng, primitive, ray_model, placed_before(rng, extent), extent, footprint=log_uniform(rng, 0.5, 1.5, count)
@@ -81,8 +82,8 @@ def several(rng, primitive, ray_model, count):
 
 
 def _thin(rng, primitive, ray_model, count, axes: int, low: float, high: float):
-    """Build primitives of which `axes` half-axes are shorter than the others by factors of 10^low to 10^high, but at
-    least 1e-6."""
+    """Build primitives with `axes` half-axes shorter than the others by factors of 10^low to 10^high, but at least
+    1e-6."""
     extent = random_extents(rng, primitive, count, low=-0.3, high=0.3)
     long = log_uniform(rng, -1, 1 if high < 5 else 3, count)[:, None]
     thin = 10 ** -rng.uniform(low, high, (count, 1))
@@ -97,20 +98,20 @@ def _thin(rng, primitive, ray_model, count, axes: int, low: float, high: float):
 
 @hard_class("needles")
 def needles(rng, primitive, ray_model, count):
-    """Two half-axes (a tetrahedron: three vertices) 10 to 1e3 times shorter than the other; it covers 1 to 300 px
-    along."""
+    """Two half-axes (tetrahedron: three vertices) 10 to 1e3 times shorter than the third; 1 to 300 px long in the
+    image."""
     return _thin(rng, primitive, ray_model, count, 2, 1, 3)
 
 
 @hard_class("plates")
 def plates(rng, primitive, ray_model, count):
-    """One half-axis (a tetrahedron: one vertex) 10 to 1e3 times shorter than the others."""
+    """One half-axis (tetrahedron: one vertex) 10 to 1e3 times shorter than the others."""
     return _thin(rng, primitive, ray_model, count, 1, 1, 3)
 
 
 @hard_class("needles 1e9")
 def extreme_needles(rng, primitive, ray_model, count):
-    """Needles of 1e-6 to 1e3 units, up to 1e9 times longer than thick: down to 1e-7 px across."""
+    """Needles of 1e-6 to 1e3 units, up to 1e9 times longer than thick, down to 1e-7 px wide."""
     return _thin(rng, primitive, ray_model, count, 2, 3, 9)
 
 
@@ -122,14 +123,14 @@ def extreme_plates(rng, primitive, ray_model, count):
 
 @hard_class("mixed axes")
 def mixed_axes(rng, primitive, ray_model, count):
-    """Every half-axis anywhere from 1e-6 to 1e3."""
+    """Each half-axis independently between 1e-6 and 1e3."""
     extent = random_extents(rng, primitive, count, low=-6, high=3)
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent)
 
 
 @hard_class("slivers", primitives=("tetrahedron",))
 def slivers(rng, primitive, ray_model, count):
-    """Tetrahedra with one vertex 10 to 1e4 times nearer to the centre or farther than the others."""
+    """Tetrahedra with one vertex 10 to 1e4 times nearer to the centre, or farther from it, than the others."""
     extent = random_extents(rng, primitive, count, low=-0.2, high=0.2)
     extent[:, 0, 0] *= 10 ** (rng.uniform(1, 4, count) * rng.choice([-1, 1], count))
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent)
@@ -137,7 +138,7 @@ def slivers(rng, primitive, ray_model, count):
 
 @hard_class("zero axes")
 def zero_axes(rng, primitive, ray_model, count):
-    """One extent 0 or negative (polyhedra), or exactly 0 (Gaussians): polyhedra are not drawn."""
+    """One extent 0 or negative (polyhedra) or exactly 0 (Gaussians). Such polyhedra are not drawn."""
     extent = random_extents(rng, primitive, count)
     center = placed_before(rng, extent)
     scenes = build(rng, primitive, ray_model, center, extent)
@@ -150,7 +151,7 @@ def zero_axes(rng, primitive, ray_model, count):
 
 @hard_class("denormal axes", value=False)
 def denormal_axes(rng, primitive, ray_model, count):
-    """One extent below the smallest normal float32, others 1e-30 to 1; thickness as it comes."""
+    """One extent below the smallest normal float32, the others 1e-30 to 1; the optical thickness is not adjusted."""
     extent = random_extents(rng, primitive, count, low=-30, high=0)
     center = placed_before(rng, random_extents(rng, primitive, count))
     extent[np.arange(count), 0, rng.integers(extent_count(primitive), size=count)] = log_uniform(rng, -44.8, -38, count)
@@ -160,7 +161,7 @@ def denormal_axes(rng, primitive, ray_model, count):
 
 @hard_class("huge axes")
 def huge_axes(rng, primitive, ray_model, count):
-    """Half-axes of 1e4 to 1e8, the camera inside or in front."""
+    """Half-axes of 1e4 to 1e8, with the camera inside or in front."""
     extent = random_extents(rng, primitive, count, low=4, high=8)
     center = placed_before(rng, extent)
     within = rng.random(count) < 0.5
@@ -178,8 +179,8 @@ def overflowing_axes(rng, primitive, ray_model, count):
 
 
 def _about_face(rng, primitive, ray_model, count, outside: bool, gap: np.ndarray):
-    """Place the camera near the plane of a face, over a point of the face or, with `outside`, beside it. `gap` is its
-    signed height over the plane, in units of the distance of the centre from the face."""
+    """Place the camera near the plane of a face, above a point of the face or, with `outside`, beside the face. `gap`
+    is its signed height above the plane, in units of the distance of the centre from the face."""
     extent = random_extents(rng, primitive, count)
     exact = rng.random(count) < 0.3
     extent[exact] = 2.0 ** np.round(np.log2(extent[exact]))
@@ -216,21 +217,21 @@ def _about_face(rng, primitive, ray_model, count, outside: bool, gap: np.ndarray
 
 @hard_class("faces edge-on", primitives=POLYHEDRA)
 def faces_edge_on(rng, primitive, ray_model, count):
-    """The camera in the plane of a face beside it, to 1e-12 ... 1e-3 of the centre's distance from it, or exactly."""
+    """The camera beside a face and in its plane, exactly or within 1e-12 to 1e-3 of the centre's distance from it."""
     gap = log_uniform(rng, -12, -3, count) * rng.choice([-1, 1], count) * (rng.random(count) < 0.8)
     return _about_face(rng, primitive, ray_model, count, True, gap)
 
 
 @hard_class("camera on a face", primitives=POLYHEDRA)
 def camera_on_a_face(rng, primitive, ray_model, count):
-    """The camera on a face or at most 1e-6 of the centre's distance from it off it."""
+    """The camera on a face, or within 1e-6 of the centre's distance from it."""
     gap = log_uniform(rng, -12, -6, count) * rng.choice([-1, 1], count) * (rng.random(count) < 0.7)
     return _about_face(rng, primitive, ray_model, count, False, gap)
 
 
 @hard_class("vertices and edges", primitives=POLYHEDRA, ties=True)
 def vertices_and_edges(rng, primitive, ray_model, count):
-    """Rays exactly through vertices, along edges and through points of edges: axes aligned, everything a power of
+    """Rays exactly through vertices, along edges and through points of edges: aligned axes, all numbers powers of
     two."""
     extent = 2.0 ** rng.integers(-3, 2, (count, 1, extent_count(primitive)))
     extent[rng.random(count) < 0.5] = 0.5
@@ -259,7 +260,7 @@ def vertices_and_edges(rng, primitive, ray_model, count):
 
 @hard_class("camera inside")
 def camera_inside(rng, primitive, ray_model, count):
-    """The camera inside the primitive; an affine one is drawn only if its centre is in front."""
+    """The camera inside the primitive. With affine rays a primitive is only drawn if its centre is in front."""
     extent = random_extents(rng, primitive, count)
     q = rng.normal(size=(count, 1, 4))
     axes = rotation_matrix(torch.from_numpy(q[:, 0])).numpy()
@@ -272,7 +273,7 @@ def camera_inside(rng, primitive, ray_model, count):
 
 @hard_class("centre behind the camera")
 def centre_behind(rng, primitive, ray_model, count):
-    """The centre behind the camera, the body in front or, once in five, wholly behind."""
+    """The centre behind the camera, with the body in front or, in one of five scenes, completely behind."""
     extent = random_extents(rng, primitive, count)
     z = -extent[:, 0].min(-1) * rng.uniform(0.05, 0.6, count)
     z = np.where(rng.random(count) < 0.2, -2 * extent[:, 0].max(-1), z)
@@ -282,7 +283,7 @@ def centre_behind(rng, primitive, ray_model, count):
 
 @hard_class("near plane")
 def near_plane(rng, primitive, ray_model, count):
-    """The near plane cuts the primitive anywhere."""
+    """Primitives cut by the near plane at any place."""
     extent = random_extents(rng, primitive, count)
     center = placed_before(rng, extent, 0.0, 0.5)
     near = np.maximum(center[:, 0, 2] + extent[:, 0].min(-1) * rng.uniform(-0.5, 0.5, count), 1e-2)
@@ -291,7 +292,7 @@ def near_plane(rng, primitive, ray_model, count):
 
 @hard_class("plates at the near plane", primitives=POLYHEDRA)
 def plates_at_near_plane(rng, primitive, ray_model, count):
-    """Plates 10 to 1e4 times thinner than wide that the near plane cuts, seen at any angle."""
+    """Plates 10 to 1e4 times thinner than wide, cut by the near plane and seen at any angle."""
     extent = random_extents(rng, primitive, count, low=-0.2, high=0.2)
     extent[:, 0, 0] *= 10 ** -rng.uniform(1, 4, count)
     center = placed_before(rng, extent, 0.0, 0.3)
@@ -301,7 +302,7 @@ def plates_at_near_plane(rng, primitive, ray_model, count):
 
 @hard_class("one pixel")
 def one_pixel(rng, primitive, ray_model, count):
-    """As large as a pixel."""
+    """Primitives of the size of a pixel."""
     extent = random_extents(rng, primitive, count)
     return build(
         rng,
@@ -315,7 +316,7 @@ def one_pixel(rng, primitive, ray_model, count):
 
 @hard_class("a thousandth of a pixel")
 def subpixel(rng, primitive, ray_model, count):
-    """A thousandth of a pixel large, hit by the one ray that is aimed at it."""
+    """Primitives of a thousandth of a pixel, hit only by the ray that is aimed at them."""
     extent = random_extents(rng, primitive, count)
     return build(
         rng,
@@ -329,7 +330,7 @@ def subpixel(rng, primitive, ray_model, count):
 
 @hard_class("a thousand screens")
 def thousand_screens(rng, primitive, ray_model, count):
-    """A thousand to 25,000 times as wide as the window: 4,000 to 100,000 px."""
+    """Primitives 1,000 to 25,000 times as wide as the window: 4,000 to 100,000 px."""
     extent = random_extents(rng, primitive, count)
     return build(
         rng, primitive, ray_model, placed_before(rng, extent), extent, footprint=log_uniform(rng, 3.6, 5, count)
@@ -338,21 +339,21 @@ def thousand_screens(rng, primitive, ray_model, count):
 
 @hard_class("a million units away")
 def far_coordinates(rng, primitive, ray_model, count):
-    """Camera and primitive at world coordinates of 1e6, where float32 resolves 0.06 units."""
+    """Camera and primitive at world coordinates of 1e6, where the resolution of float32 is 0.06 units."""
     extent = random_extents(rng, primitive, count)
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent, pose=random_poses(rng, count, 1e6))
 
 
 @hard_class("thickness 1e-12 to 1e4", primitives=POLYHEDRA)
 def any_thickness(rng, primitive, ray_model, count):
-    """Optical thickness 1e-12 to 1e4 of two that overlap."""
+    """Two primitives that overlap, with optical thicknesses of 1e-12 to 1e4."""
     extent = random_extents(rng, primitive, count, 2)
     return build(rng, primitive, ray_model, placed_before(rng, extent), extent, tau=log_uniform(rng, -12, 4, count, 2))
 
 
 @hard_class("ends of the opacity")
 def ends_of_opacity(rng, primitive, ray_model, count):
-    """Density from a raw value of -80 to 80 by softplus over the reference length; a Gaussian's by the logistic
+    """Density from a raw value of -80 to 80, by softplus over the reference length; for Gaussians by the logistic
     function."""
     extent = random_extents(rng, primitive, count)
     raw = rng.uniform(-80, 80, (count, 1)) * rng.choice([0.05, 1.0], (count, 1))
@@ -365,7 +366,7 @@ def ends_of_opacity(rng, primitive, ray_model, count):
 
 @hard_class("coincident")
 def coincident(rng, primitive, ray_model, count, many: int = 200):
-    """Two hundred times the same primitive, of densities 1e-3 to 1 times a two-hundredth; one colour."""
+    """200 copies of the same primitive in one colour, with densities of 1e-3 to 1 times 1/200."""
     extent = np.repeat(random_extents(rng, primitive, count), many, 1)
     center = np.repeat(placed_before(rng, extent[:, :1]), many, 1)
     tau = log_uniform(rng, -3, 0, count, many) * log_uniform(rng, -1, 1, count, 1) / many
@@ -377,7 +378,7 @@ def coincident(rng, primitive, ray_model, count, many: int = 200):
 
 @hard_class("equal depth")
 def equal_depth(rng, primitive, ray_model, count):
-    """Four that overlap with centres at exactly the same depth, listed in any order."""
+    """Four primitives that overlap, with centres at exactly the same depth, in any order."""
     extent = random_extents(rng, primitive, count, 4, -0.3, 0.3)
     center = placed_before(rng, extent)
     center[:, :, 2] = center[:, :1, 2]
@@ -387,7 +388,7 @@ def equal_depth(rng, primitive, ray_model, count):
 
 @hard_class("quaternions")
 def quaternions(rng, primitive, ray_model, count):
-    """Quaternions of length 1e-18 to 1e18, and one in ten of length 0, which is no rotation."""
+    """Quaternions of length 1e-18 to 1e18, and one in ten of length 0, which stands for no rotation."""
     extent = random_extents(rng, primitive, count)
     q = rng.normal(size=(count, 1, 4)) * log_uniform(rng, -18, 18, count)[:, None, None]
     q[rng.random(count) < 0.1] = 0

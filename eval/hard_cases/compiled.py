@@ -1,4 +1,5 @@
-"""Images and gradients of batches of tiny scenes by each variant of the compiled kernels, checked to be finite."""
+"""Renders batches of tiny scenes and their gradients with each variant of the compiled kernels, and checks that the
+results are finite."""
 
 from __future__ import annotations
 
@@ -38,7 +39,7 @@ class Variant:
 
 
 def variants(scalars: Sequence[str] = tuple(SCALARS)) -> list[Variant]:
-    """Return all variants that the core has kernels for; both ray models of a Gaussian are the same and count once."""
+    """Return all variants for which the core has kernels. Both ray models of a Gaussian are the same and count once."""
     return [
         Variant(*variant)
         for variant in itertools.product(ops.KINDS, ops.RAY_MODELS, ops.ORDERS, scalars)

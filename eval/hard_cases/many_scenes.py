@@ -1,9 +1,9 @@
 """A float64 reference rasterizer for batches of thousands of tiny scenes.
 
-It computes the same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time, in another
-way. That one uses frames at the primitive and a loop over primitives. This one uses face planes in camera space, tables
-over (scene, ray, primitive, face), and depths relative to the ray's point nearest to the centre, so that the chord of a
-small distant primitive keeps its digits.
+It computes the same model as `linprim_geo.kernels.reference.rasterize`, which takes one scene at a time, by a different
+method. That one uses local frames of primitives and a loop over primitives. This one uses face planes in camera space,
+tables over (scene, ray, primitive, face), and depths relative to the point of the ray nearest to the centre, so that
+the chord of a small distant primitive keeps its precision.
 """
 
 from __future__ import annotations
@@ -152,13 +152,13 @@ def _lines(s: Scenes, center: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Ten
 
 @dataclass(frozen=True)
 class Chords:
-    """The chords of every ray in every primitive, (B, R, M) each."""
+    """The chords of all rays through all primitives, (B, R, M) each."""
 
     hit: Tensor
     tau: Tensor
     t_in: Tensor  # z-depth; 0 without a hit
     t_out: Tensor
-    # Two answers are right: a Gaussian's alpha is within rounding of a threshold, or the ray lies in a face's plane.
+    # Two results are correct: a Gaussian's alpha is within rounding of a threshold, or the ray lies in a face's plane.
     doubtful: Tensor
     of_entry: Tensor  # tau up to the entry, from an arbitrary origin, so that of_exit - of_entry = tau
     of_exit: Tensor

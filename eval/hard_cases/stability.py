@@ -1,26 +1,27 @@
-"""How far the compiled rasterizer is from float64 truth on hard cases: `python -m linprim_geo.eval.hard_cases.stability
-[--json]`.
+"""Measures the errors of the compiled rasterizer on hard cases, against a reference in float64.
+
+    python -m linprim_geo.eval.hard_cases.stability [--json]
 
 Every class of `classes.py` is rendered and differentiated by every variant of the kernels (primitive, ray model, order,
 scalar) that the core has, and compared with `linprim_geo.eval.hard_cases.many_scenes`. A forward case is one ray of one
-scene. A gradient case is one scene's gradient of a randomly weighted sum of its rgb and opacity. The exit status is 1
-unless all of this holds:
+scene. A gradient case is the gradient of a randomly weighted sum of the rgb and opacity of one scene. The exit status
+is 1 unless all of this holds:
 
     finite      no NaN or infinity in any image or gradient, including those of the geometric images
     share       0 <= opacity <= 1
     forward     every ray is within the bound that `rounding_bounds.rounding` derives for it, times BOUND
     gradient    resolved scenes are within 1e-3 of the reference, and no error exceeds the gradient's own magnitude; for
-                polyhedra on 99.9 % of the cases, as a ray within rounding of an edge has the gradient of either face
+                polyhedra in 99.9 % of the cases, as a ray within rounding of an edge has the gradient of either face
 
 A scene is resolved if the same bound leaves the sum of its rays' alphas accurate to 1e-4. A needle a millionth of a
-pixel wide has no gradient in single precision, nor has a face within 1e-6 of edge-on. The table shows the resolved
-share.
+pixel wide has no gradient in single precision, and neither has a face within 1e-6 of edge-on. The table shows the share
+of resolved scenes.
 
-A gradient is the difference of the contributions of a ray's entry and exit, and is small behind opaque things. No
-scalar resolves a gradient that cancels to less than a few eps of these contributions without absorption. Such errors
-are relative to that many eps / 1e-3 of the contributions: the roundings of the sums, and the condition of the gradient
-that rounding_bounds.py derives, `gradient_condition` for polyhedra and `gaussian_gradient_rounding` for Gaussians. No
-limit was taken from results of a processor.
+A gradient is the difference of the contributions of a ray's entry and exit, and is small behind opaque primitives. A
+gradient that cancels to less than a few eps of these contributions without absorption cannot be resolved in any
+precision. Such errors are taken relative to that many eps / 1e-3 of the contributions. The factor counts the roundings
+of the sums and the condition of the gradient that rounding_bounds.py derives, `gradient_condition` for polyhedra and
+`gaussian_gradient_rounding` for Gaussians. No limit is fitted to the results of a processor.
 """
 
 from __future__ import annotations
@@ -325,20 +326,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m linprim_geo.eval.hard_cases.stability", description=__doc__.split("\n")[0]
     )
-    parser.add_argument("--json", action="store_true", help="print JSON in place of the table")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of the table")
     parser.add_argument(
         "--cases",
         type=int,
         default=10_000,
         metavar="N",
-        help="rays of each class on each variant (default: %(default)s)",
+        help="least number of rays per class and variant (default: %(default)s)",
     )
     parser.add_argument(
         "--gradients",
         type=int,
         default=2_000,
         metavar="N",
-        help="scenes of each class and primitive whose gradient is taken, for all variants (default: %(default)s)",
+        help="least number of scenes with a gradient per class and primitive (default: %(default)s)",
     )
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     parser.add_argument(
@@ -346,11 +347,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="+",
         choices=hard_cases.CLASSES,
         metavar="CLASS",
-        help="only these; --list names them",
+        help="only these classes; --list prints them",
     )
     parser.add_argument("--primitives", nargs="+", choices=ops.KINDS, default=ops.KINDS)
     parser.add_argument("--scalars", nargs="+", choices=tuple(SCALARS), default=tuple(SCALARS))
-    parser.add_argument("--list", action="store_true", help="say what each class holds, and end")
+    parser.add_argument("--list", action="store_true", help="describe the classes and exit")
     options = parser.parse_args(arguments)
     if options.list:
         for name, what in hard_cases.CLASSES.items():

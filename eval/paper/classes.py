@@ -1,4 +1,4 @@
-"""LinPrim's table 3: PSNR of the held-out views by semantic class, given label images."""
+"""Table 3 of the LinPrim paper: PSNR of the held-out views by semantic class, given label images."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ def class_errors(folder: Path, labels: Path) -> dict[int, tuple[float, int]]:
 
 
 def read_labels(folder: Path, view: View) -> np.ndarray:
-    """Return (H, W) integer labels at the pixels of the view's camera. Of each block of pixels that is averaged to one,
-    the middle one gives the label."""
+    """Return (H, W) integer labels at the pixels of the view's camera. In each block of pixels that is averaged into
+    one, the middle pixel gives the label."""
     from PIL import Image, UnidentifiedImageError
 
     file = next(
@@ -116,7 +116,7 @@ def _psnr(error: float) -> float:
 
 
 def stand_in_labels(folder: Path, shape: str, views: tuple[View, ...]) -> Path:
-    """Render the part of a built-in scene at each pixel's centre to label images, unless `folder` has them; return
+    """Write label images with the part of a built-in scene at each pixel centre, unless `folder` has them, and return
     `folder`."""
     from PIL import Image
 

@@ -1,4 +1,4 @@
-"""Compares two curves of quality over cost at equal cost, or at equal quality."""
+"""Compares two curves of quality against cost, at equal cost or at equal quality."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LEVELS = 3  # number of levels at which two curves are compared: both ends and t
 
 
 def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
-    """Return the points (x, psnr, ...) sorted by x, without those whose PSNR does not exceed that of all points before
+    """Return the points (x, psnr, ...) sorted by x, without those whose PSNR is not above that of all points before
     them."""
     kept: list[tuple[float, ...]] = []
     for point in sorted(map(tuple, points)):
@@ -24,8 +24,8 @@ def rising(points: Sequence[Sequence[float]]) -> list[tuple[float, ...]]:
 def at_psnr(points: Sequence[Sequence[float]], level: float) -> tuple[float, ...] | None:
     """Return all but the PSNR of (count, psnr, cost, ...), all > 0, at PSNR `level` on the curve `rising(points)`.
 
-    Between neighbours the logarithms are linear in the PSNR: log x = (1 - f) log x0 + f log x1, f = (level - p0) / (p1
-    - p0). None outside of the range of the curve; that of a single point is its own PSNR.
+    Logarithms are interpolated linearly in the PSNR between neighbours: log x = (1 - f) log x0 + f log x1, with f =
+    (level - p0) / (p1 - p0). None outside of the range of the curve; the range of a single point is its own PSNR.
     """
     curve = rising(points)
     for point in curve:

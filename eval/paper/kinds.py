@@ -1,5 +1,5 @@
-"""LinPrim's tables 1, 6 and 8, which compare kinds of primitives: counts and cost, work, stages, equal quality and
-equal time."""
+"""Tables 1, 6 and 8 of the LinPrim paper, which compare kinds of primitives: counts and cost, work, stages; and
+comparisons at equal quality and at equal time."""
 
 from __future__ import annotations
 
@@ -137,32 +137,28 @@ def scene_text(scene: str, rows: Sequence[dict], comparison: dict) -> str:
 def footnotes(rows: Sequence[dict]) -> str:
     """Return the notes needed to quote the tables."""
     lines = [
-        "Frames: of every view the median of interleaved repetitions, then the mean over views; CPU is the "
-        "rendering thread's own time. "
-        "Core is the sum of the stages (wall): without the call from Python, its checks for NaN and the images' "
-        "memory.",
-        f"Instruction set {', '.join(sorted({r['instruction_set'] for r in rows}))}. In frustum: not culled, its "
-        "footprint holds a pixel. "
-        "Iterated: pixels, by blocks of 4x4, tested against a primitive of their tile's list; intersected: those "
-        "hit by it while the "
-        "ray was alive.",
-        "Equal PSNR: log count and log ms linear in PSNR between neighbouring sizes, at both ends and the middle "
-        "of what the two share.",
-        "Training CPU s: process time of the steps alone. PSNR linear in log time; sizes that cost more and "
-        "score less are left out.",
-        "Along one training the step sizes are still large before its end, so the slower kinds look worse there "
-        "than if they had been "
-        "planned for that time; the finished trainings do not have this flaw.",
-        "Start thinness: shortest by longest axis of the first primitives, 1 = as long in all directions. Where "
-        "kinds differ in it, they "
-        "did not start alike: the trainer lays some kinds flat on the surface and others not.",
-        "One seed: differences below 0.2 dB say nothing.",
+        "Frames: median over interleaved repetitions of each view, then the mean over views; CPU is the time of the "
+        "rendering thread. "
+        "Core is the sum of the stages (wall); it excludes the call from Python, its checks for NaN and the "
+        "allocation of images.",
+        f"Instruction set {', '.join(sorted({r['instruction_set'] for r in rows}))}. In frustum: primitives that "
+        "are not culled and whose footprint contains a pixel. Iterated: pixels, in blocks of 4x4, that are tested "
+        "against a primitive of their tile's list. Intersected: those that it hits before their ray has ended.",
+        "Equal PSNR: log count and log ms are interpolated linearly in PSNR between neighbouring sizes, at both ends "
+        "and the middle of the common range.",
+        "Training CPU s: process time of the steps only. PSNR is interpolated linearly in log time; sizes that cost "
+        "more and score less are left out.",
+        "Along one training, learning rates are still high before its end, so slower kinds look worse than in a "
+        "training planned for that time. Finished trainings do not have this flaw.",
+        "Start thinness: shortest divided by longest axis of the initial primitives; 1 is isotropic. Kinds that "
+        "differ in it do not start alike: the trainer lays only some kinds flat on the surface.",
+        "One seed: differences below 0.2 dB are not significant.",
     ]
     if any(r["held_out_views"] >= 2 * QUICK_VIEWS for r in rows):
         lines.append(f"During training some {QUICK_VIEWS} of the held-out views are scored, all of them at the end.")
     if any(r["options"]["samples"] == 1 for r in rows):
         lines.append(
-            "One ray per pixel: photographs average over a pixel, so sharp edges of polyhedra alias; --samples 2 "
-            "averages too."
+            "One ray per pixel: sharp edges of polyhedra alias, while photographs average over a pixel, as --samples 2 "
+            "does."
         )
     return "Notes\n" + "\n".join(f"* {line}" for line in lines)

@@ -73,33 +73,32 @@ TABLES = {
     "3": Table(
         "Table 3: PSNR by class",
         classes,
-        "Of the mean squared error over all pixels of a class in all held-out views; the paper does not say how "
-        "it averages.",
+        "From the mean squared error over all pixels of a class in all held-out views; the paper does not state its "
+        "way of averaging.",
     ),
     "4": Table(
         "Table 4: zooming out, trained at full size",
         paper_studies.zooming_out,
-        "Photographs averaged down; rendered with one ray per pixel (--samples) of the smaller image.",
+        "Photographs are averaged down; renders have one ray per pixel of the smaller image (--samples).",
     ),
     "7": Table(
         "Tables 7 and 11: fixed counts, MCMC",
         paper_studies.fixed_counts,
-        "Here :3dgs and :mcmc are the papers' rules of growth in the same trainer, with their largest number.",
+        ":3dgs and :mcmc are the densification rules of these papers in the same trainer; :3dgs has the largest of "
+        "--caps.",
     ),
     "9": Table(
         "Table 9: depth",
         depths,
-        "Median depth of all photographs; L1 and L2 per photograph over pixels valid in both, mean and deviation "
-        "over photographs, in the "
-        "data set's unit (published: metres).",
+        "Median depth of all photographs. L1 and L2 per photograph over pixels that are valid in both; mean and "
+        "standard deviation over photographs, in the data set's unit (published: metres).",
     ),
     "10": Table(
         "Table 10: Chamfer distance",
         chamfers,
-        "TSDF of depth at half transmittance, 5 cm voxels where the unit is the metre and 1/150 of the diagonal "
-        "elsewhere, 5,000 points "
-        "per surface, mean of both directions, in the data set's unit (published: metres; perhaps the sum of the "
-        "directions).",
+        "TSDF of depth at half transmittance, with voxels of 5 cm, or 1/150 of the diagonal if the unit is not the "
+        "metre; 5,000 points per surface; mean of both directions in the data set's unit (published: metres; perhaps "
+        "the sum of both directions).",
     ),
     "12": Table(
         "Table 12: octahedra against tetrahedra",
@@ -109,7 +108,7 @@ TABLES = {
     "rays": Table(
         "Ablation: exact against affine rays",
         paper_studies.rays,
-        "Trained and rendered by the same rays; frames on one thread.",
+        "Each is trained and rendered with the same kind of rays; frames on one thread.",
     ),
 }
 SAME = {"11": "7"}

@@ -1,5 +1,5 @@
-"""The models of the paper's tables: trains each once, by the function behind `linprim-geo train`, and measures the cost
-of a frame."""
+"""The models of the paper's tables: trains each of them once, with the function behind `linprim-geo train`, and
+measures the cost of a frame."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COUNTS = {
 
 @dataclass(frozen=True)
 class Variant:
-    """A kind of primitive and the rule of densification."""
+    """A kind of primitive and its densification rule."""
 
     kind: str
     population: str
@@ -66,7 +66,7 @@ class Variant:
 
 
 class _Measured:
-    """Counts the seconds of `train` as CPU seconds of this process, which other work on the machine does not affect.
+    """Counts the seconds of `train` as CPU seconds of this process, which do not include other work on the machine.
 
     `record` gets `start_count`, `start_thinness` (`thinness` before the first step) and `train_wall_seconds` of all
     steps.
@@ -91,7 +91,7 @@ class _Measured:
 
 @functools.cache
 def _warm_up(capture: Path, scene_options: SceneOptions) -> None:
-    """Train two steps without using the result. The first steps of a process load code, and would otherwise count for
+    """Train two steps and discard the result. The first steps of a process load code, which would otherwise count for
     the first kind that is trained."""
     with tempfile.TemporaryDirectory() as folder:
         options = TrainOptions(iterations=2, max_primitives=50, threads=1)

@@ -1,5 +1,5 @@
-"""Results published by LinPrim's authors, for comparison with ours. They are of other scenes than the built-in ones, of
-other machines, and of 30,000 steps on a GPU.
+"""Results published by LinPrim's authors, for comparison. They are for other scenes than the built-in ones, another
+machine, and 30,000 steps on a GPU.
 
 Source: von Luetzow and Niessner, arXiv 2501.16312, and their answers to its reviewers. Unpublished values are left out.
 Scenes are those of ScanNet++ (39f36da05b, 5a269ba6fe, dc263dfbf0), Mip-NeRF 360 and NeRF-synthetic.

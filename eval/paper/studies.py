@@ -1,5 +1,5 @@
-"""LinPrim's ablation tables: degree of the colour, zooming out, fixed counts, tetrahedra; and exact against affine
-rays, an ablation that its authors promised.
+"""The ablation tables of the LinPrim paper: degree of the colour, zooming out, fixed counts, tetrahedra; and exact
+against affine rays, an ablation that its authors announced.
 
 Each function takes a `Case` and returns the rows of its table for that scene: `scene`, `method`, `source` and the
 results.
@@ -18,7 +18,7 @@ from linprim_geo.eval.paper.models import Model, Variant, measure, train_model
 from linprim_geo.runs.run import Run
 
 SCALES = (1, 2, 4, 8)
-# The keys of eval-images for the columns of quality; LPIPS as in the publication.
+# Keys of eval-images for the columns of quality; LPIPS as in the publication.
 QUALITY = {"ssim": "ssim", "psnr": "psnr", "lpips": "lpips_vgg_3dgs"}
 
 
@@ -39,7 +39,7 @@ class Case:
     labels: Path | None = None
 
     def trained(self, variant: Variant, **options) -> Path:
-        """Return the run folder of a variant with other options; train it unless it is there."""
+        """Return the run folder of a variant with changed options; train it if it does not exist."""
         given = replace(self.options, primitive=variant.kind, population=variant.population)
         wanted = replace(given, **options)
         parts = [variant.name.replace(":", "_"), str(wanted.max_primitives)]
@@ -129,7 +129,7 @@ def rays(case: Case) -> list[dict]:
 
 def _costed(case: Case, folders: dict[str, Path]) -> list[dict]:
     """Return rows of quality with the CPU seconds of training and the CPU time of a frame, measured for all models in
-    turn."""
+    an interleaved order."""
     frames = measure([Model.open(folder) for folder in folders.values()], case.repeats)
     rows = []
     for (method, folder), frame in zip(folders.items(), frames, strict=True):

@@ -1,4 +1,4 @@
-"""LinPrim's tables 9 and 10: errors of the depth, and of the surface fused from it."""
+"""Tables 9 and 10 of the LinPrim paper: errors of the depth and of the surface fused from it."""
 
 from __future__ import annotations
 

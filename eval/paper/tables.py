@@ -1,4 +1,4 @@
-"""LinPrim's tables on a CPU, with the authors' figures beside ours.
+"""Reproduces the tables of the LinPrim paper on a CPU and prints the authors' results next to them.
 
     python -m linprim_geo.eval.paper.tables -o runs/paper [--tables 2 4 9 ...] [--data CAPTURE ...] [--quick]
 
@@ -9,11 +9,11 @@
     4        zooming out with and without filters            10       Chamfer distance of a TSDF at 5 cm, 5,000 samples
     12       octahedra against tetrahedra                    rays     exact against affine rays
 
-Models are trained by the function behind `linprim-geo train`, and what is trained already is taken from the output
-folder. All but 1, 6, 8, 7 and 11 use the largest of --caps alone. Written are table_N.txt and table_N.json, and for 1,
-6 and 8 paper_tables.txt, .json and .csv. Everything but the times is the same in every run on one instruction set. The
-scenes `cad` and `room` are built in, others are captures. Source of the tables' layout: von Luetzow and Niessner, arXiv
-2501.16312; there a GPU renders, and other scenes.
+Models are trained with the function behind `linprim-geo train`; models in the output folder are reused. Tables other
+than 1, 6, 8, 7 and 11 use only the largest of --caps. The output is table_N.txt and table_N.json, and for 1, 6 and 8
+paper_tables.txt, .json and .csv. On one instruction set everything but the times is reproducible. The scenes `cad` and
+`room` are built in; others are captures. Layout of the tables: von Luetzow and Niessner, arXiv 2501.16312, who render
+other scenes on a GPU.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         choices=names,
         default=list(OF_KINDS),
         metavar="N",
-        help="see above; all (default 1 6 8)",
+        help="tables to make, see above, or all (default 1 6 8)",
     )
     parser.add_argument(
         "--data",
@@ -77,16 +77,18 @@ def _parser() -> argparse.ArgumentParser:
         nargs="*",
         default=[],
         metavar="CAPTURE",
-        help="captures to train on beside --scenes",
+        help="captures to use in addition to --scenes",
     )
     text = (
-        "surfaces of the captures in their frames, in the same order (default: reference.ply in the capture, "
-        "else its depth images)"
+        "reference meshes of the captures, in their frames and in the same order (default: reference.ply in the "
+        "capture, else its depth images)"
     )
     parser.add_argument("--references", type=Path, nargs="*", default=[], metavar="MESH", help=text)
-    text = "folders of label images of the captures' held-out views, in the same order; built-in scenes have their own"
+    text = "folders with label images of the captures' held-out views, in the same order; built-in scenes need none"
     parser.add_argument("--labels", type=Path, nargs="*", default=[], metavar="DIR", help=text)
-    parser.add_argument("--downscale", type=int, default=1, metavar="K", help="of the captures: average K by K pixels")
+    parser.add_argument(
+        "--downscale", type=int, default=1, metavar="K", help="average K by K pixels of the captures into one"
+    )
     parser.add_argument(
         "--scenes",
         nargs="*",
@@ -101,24 +103,28 @@ def _parser() -> argparse.ArgumentParser:
         metavar="KIND[:POPULATION]",
         default=[Variant.parse(k) for k in KINDS],
     )
-    parser.add_argument("--caps", type=int, nargs="+", default=list(CAPS), metavar="N", help="largest populations")
+    parser.add_argument(
+        "--caps", type=int, nargs="+", default=list(CAPS), metavar="N", help="largest numbers of primitives"
+    )
     parser.add_argument("--iterations", type=int, default=3000)
-    parser.add_argument("--size", type=int, default=256, help="of the built-in scenes, pixels")
+    parser.add_argument("--size", type=int, default=256, help="image side of the built-in scenes, in pixels")
     parser.add_argument("--views", type=int, default=VIEWS)
     parser.add_argument("--test-views", type=int, default=TEST_VIEWS)
     parser.add_argument("--sh-degree", type=int, default=TrainOptions.sh_degree)
     parser.add_argument("--samples", type=int, default=TrainOptions.samples)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--repeats", type=int, default=9, help="measured frames per view")
-    parser.add_argument("--lpips-weights", metavar="PATH", help="as of linprim-geo eval-images")
+    parser.add_argument("--repeats", type=int, default=9, help="timed frames per view")
+    parser.add_argument("--lpips-weights", metavar="PATH", help="see linprim-geo eval-images")
     text = (
-        "train the models of so many scenes at once, a worker each; 0: one per core; frames are measured "
-        "alone after that (default: 1)"
+        "train the models of N scenes in parallel, one worker each; 0: one per core; frames are timed afterwards, one "
+        "at a time (default: 1)"
     )
     parser.add_argument("--workers", type=int, default=1, metavar="N", help=text)
-    parser.add_argument("--cluster", metavar="local|ADDRESS", help="train on Ray, as of linprim-geo train")
+    parser.add_argument("--cluster", metavar="local|ADDRESS", help="train on Ray, see linprim-geo train")
     parser.add_argument(
-        "--quick", action="store_true", help="tiny and meaningless: 48 pixels, 120 steps, 200 primitives"
+        "--quick",
+        action="store_true",
+        help="tiny test without meaningful results: 48 pixels, 120 steps, 200 primitives",
     )
     return parser
 

@@ -9,7 +9,7 @@ from linprim_geo.eval.surface_samples import corner_and_edges, morton_order
 from linprim_geo.geometry.mesh import Mesh
 
 MAX_POINTS = 60_000_000
-"""Largest number of points. No published benchmark has as many; a mesh that needs more has the wrong unit."""
+"""Largest number of points, more than any published benchmark has. A mesh that needs more is in the wrong unit."""
 
 THIN_START = 100_000
 """Points of the first round of `thin`; each later round processes as many as all before it."""
@@ -22,12 +22,11 @@ def lattice_points(mesh: Mesh, step: float) -> np.ndarray:
     """Return (P, 3) points on a lattice along two edges of each face, one per `step` squared of its area.
 
     The edges a-b and a-c, of lengths l and m and with an angle whose sine is s, are divided into floor(l / h) and
-    floor(m / h) pieces with h = step / sqrt(s), so that a cell has an area of step^2 or a little more. The points are
+    floor(m / h) pieces with h = step / sqrt(s), so that a cell has an area of step^2 or slightly more. The points are
     the centres of the cells that lie in the triangle. A face too small for one cell has no points.
 
     Raises:
-        LinprimError: there would be more than `MAX_POINTS`.
-        LinprimError: more than `MAX_POINTS` would come out.
+        LinprimError: there would be more than `MAX_POINTS` points.
     """
     origin, edge_b, edge_c = corner_and_edges(mesh)
     lengths = np.linalg.norm(edge_b, axis=1), np.linalg.norm(edge_c, axis=1)
@@ -57,11 +56,12 @@ def lattice_points(mesh: Mesh, step: float) -> np.ndarray:
 
 
 def thin(points: np.ndarray, radius: float, seed) -> np.ndarray:
-    """Return the sorted indices of the points that remain when, in random order, each one removes all within `radius`.
+    """Return the sorted indices of the points that remain when, in random order, each remaining point removes all
+    others within `radius`.
 
-    The result is that of a loop over the shuffled points: a point remains unless one before it has remained and is no
-    farther away than `radius`. It is computed in rounds, each over as many points as all rounds before, so that memory
-    does not grow with the density of the points.
+    The result is that of a loop over the shuffled points: a point remains unless an earlier remaining point is at most
+    `radius` away. It is computed in rounds, each over as many points as all rounds before, so that memory does not grow
+    with the density of the points.
 
     Args:
         points: (P, 3) finite.

@@ -1,8 +1,8 @@
-"""Mesh protocols of published tables, each after its description, for comparison with these tables.
+"""Mesh protocols of published tables, implemented after their descriptions, for comparison with these tables.
 
-They do not measure quality as the headline protocol does: distances are from points to points, so a perfect mesh does
-not score zero (with N independent points on an area A the mean distance is about sqrt(A / N) / 2), and some depend on
-the triangulation. Each result states the sampling, the culling and the kept shares.
+Unlike the headline protocol, they measure distances from points to points. A perfect mesh therefore does not score
+zero: with N independent points on an area A, the mean distance is about sqrt(A / N) / 2. Some scores also depend on the
+triangulation. Each result states the sampling, the culling and the kept shares.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ TNT_CELL = 0.5  # edge, in tau, of the cells whose points are averaged
 TNT_DENSITY = 4.0  # uniform points per tau squared; a perfect plane then has recall 0.99998
 
 RANDOM_SETS_ERROR = 2.0
-"""Factor on the standard error of independent distances where both point sets are independent random points. The other
-set is random too, and both directions share the sets; each contributes a root of two. The spread over seeds was 0.5 to
-0.9 of the result, both where distances are due to the spacing alone and where they are not."""
+"""Factor on the standard error of independent distances if both point sets are independent random points. The target
+set is random too, and both directions share the sets; each contributes a factor of sqrt(2). The spread over seeds was
+measured as 0.5 to 0.9 of the result, both where distances are due to the point spacing alone and where they are not."""
 
 SCANNETPP_EDGE, SCANNETPP_HIDDEN, SCANNETPP_TAU = 0.015, 0.02, 0.05  # metres
 SCANNETPP_VIEWS = 4  # "more than three"

@@ -1,1 +1,1 @@
-"""What accuracy costs in time: sweeps over options, tables and figures."""
+"""Measures accuracy against time: sweeps over options, tables and figures."""

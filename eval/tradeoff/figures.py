@@ -1,11 +1,11 @@
-"""The two plots of docs/accuracy_and_time.md out of a sweep: what the ladder of rendering costs, and what surfaces cost
-in training and in extraction.
+"""Makes the two plots of docs/accuracy_and_time.md from a sweep: accuracy and time of rendering settings, and of
+surfaces over training and over extraction.
 
     linprim-geo tradeoff SCENE -o SWEEP
     python -m linprim_geo.eval.tradeoff.figures SWEEP -o docs/images
 
-writes tradeoff_ladder.svg and tradeoff_surface.svg, each two panels on a ground of its own, light or dark as the reader
-has it.
+Writes tradeoff_ladder.svg and tradeoff_surface.svg. Each has two panels, and a light or dark background as the reader's
+system prefers.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ TWICE = re.compile(r"^2 of the ")
 
 def plotted_values(rows: Sequence[dict], parameters: Sequence[str], error: str) -> list[dict]:
     """Return the measured values of some parameters for one plot: with display names, the shared default only once, and
-    a new frontier of all of them."""
+    the frontier of all of them."""
     found, default = [], None
     for row in rows:
         if row["parameter"] not in parameters or row.get(error) is None or row["seconds"] <= 0:
@@ -111,7 +111,7 @@ def figures(sweep: Path, output: Path) -> list[Path]:
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sweep", type=Path, metavar="SWEEP", help="folder that linprim-geo tradeoff has made")
+    parser.add_argument("sweep", type=Path, metavar="SWEEP", help="output folder of linprim-geo tradeoff")
     parser.add_argument("-o", "--output", type=Path, default=Path("tools"), metavar="DIR", help="default tools")
     args = parser.parse_args(arguments)
     try:

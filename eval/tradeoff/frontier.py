@@ -1,5 +1,5 @@
-"""Evaluates the sweep of a parameter: the Pareto frontier of time and error, and whether more expensive settings are
-worth it."""
+"""Evaluates the sweep of a parameter: the Pareto frontier of time and error, and which slower settings are worth their
+time."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from collections.abc import Sequence
 
 from linprim_geo.eval.tradeoff.parameters import ERRORS, Parameter
 
-# A more expensive value is worth its time if error ~ time^-r with r at least RETURN. Averaging independent samples
-# gives 0.5, and is always another way to spend time. A reduction of the error by less than LEAST_GAIN, a share, does
-# not count.
+# A slower value is worth its time if error ~ time^-r with r at least RETURN. Averaging independent samples gives 0.5,
+# which is always an alternative. A relative reduction of the error below LEAST_GAIN does not count.
 RETURN, LEAST_GAIN = 0.5, 0.01
 RULE = (
-    "A more expensive value is worth it if it divides the error by at least the root of what it multiplies the time "
-    "by, as averaging independent samples would, and removes at least 1 % of it. Values are looked at from the fastest "
-    "on, along the frontier. Where the middle halves of two timings overlap, they count as equal."
+    "A slower value is worth it if it reduces the error at least by the square root of the factor of its time, as "
+    "averaging independent samples would, and by at least 1 %. Values are compared along the frontier, from the "
+    "fastest on. Timings whose interquartile ranges overlap count as equal."
 )
 
 
 def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Return the indices of the (seconds, error) that no other is below in both, from the fastest on; the first of
-    equal ones. Points with NaN are left out."""
+    """Return the indices of the points (seconds, error) on the Pareto frontier, from the fastest on: no other point is
+    lower in both. Of equal points the first counts. Points with NaN are left out."""
     order = sorted((p for p in range(len(points)) if all(map(math.isfinite, points[p]))), key=lambda p: (*points[p], p))
     kept: list[int] = []
     for k in order:
@@ -31,7 +30,7 @@ def frontier(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def pays(cheap: dict, expensive: dict, error: str) -> bool:
-    """Return whether the step from one row to a more expensive one is worth it by RULE."""
+    """Return whether the step from a row to a slower one is worth its time by RULE."""
     a, b = cheap[error], expensive[error]
     if not b < (1 - LEAST_GAIN) * a:
         return False
@@ -49,8 +48,8 @@ def same_time(one: dict, other: dict) -> bool:
 def verdict(parameter: Parameter, rows: Sequence[dict]) -> dict:
     """Return the sentence about a parameter, and `error`, `cheapest`, `taken`, `most_accurate` (names of values).
 
-    A row has `value`, `seconds`, `low`, `high`, `rounds`, and the errors. The decision uses the first of the
-    parameter's errors that all rows have.
+    A row has `value`, `seconds`, `low`, `high`, `rounds` and the errors. The verdict uses the first of the parameter's
+    errors that all rows have.
     """
     rows = [row for row in rows if math.isfinite(row.get("seconds", math.nan))]
     measured = [
@@ -58,7 +57,10 @@ def verdict(parameter: Parameter, rows: Sequence[dict]) -> dict:
     ]
     title = parameter.title[0].upper() + parameter.title[1:]
     if not measured or len(rows) < 2:
-        return {"sentence": f"{title}: nothing here to judge it by.", "error": None}
+        return {
+            "sentence": f"{title}: no verdict, as fewer than two values or no common error were measured.",
+            "error": None,
+        }
     error = measured[0]
     on = [rows[k] for k in frontier([(row["seconds"], row[error]) for row in rows])]
     cheapest, best = on[0], on[-1]

@@ -1,4 +1,4 @@
-"""The report of a sweep: one HTML file with a plot and a table per parameter. It is well-formed XML, without scripts or
+"""The HTML report of a sweep: one file with a plot and a table per parameter. It is well-formed XML without scripts or
 external resources."""
 
 from __future__ import annotations
@@ -28,12 +28,9 @@ def page(results: dict, parameters: dict[str, Parameter]) -> str:
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"/><title>What accuracy costs in time</title>',
         f"<style>{STYLE}</style></head><body><h1>What accuracy costs in time</h1>",
         f'<p class="small">Scene {escape(about["scene"])}, {about["options"]["iterations"]} steps and '
-        f"{about['options']['max_primitives']} "
-        f"primitives where a parameter does not say otherwise; {about['rounds']} rounds, load {about['load']:.1f} on "
-        f"{about['cores']} cores. "
-        "Times are medians with their quartiles; blue points lie on the frontier, which no other setting beats "
-        "in both time and error; a "
-        "ring marks the default.</p>",
+        f"{about['options']['max_primitives']} primitives unless a parameter changes them; {about['rounds']} rounds, "
+        f"load {about['load']:.1f} on {about['cores']} cores. Times are medians with quartiles. Blue points are on the "
+        "Pareto frontier: no other setting is better in both time and error. A ring marks the default.</p>",
     ]
     for name, parameter in parameters.items():
         rows = [row for row in results["rows"] if row["parameter"] == name]

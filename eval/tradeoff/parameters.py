@@ -1,9 +1,9 @@
-"""The parameters that trade time for accuracy: their values from cheap to expensive, and the errors that judge them.
+"""The parameters that trade time for accuracy: their values from fast to slow, and the errors by which they are judged.
 
 A value is a dict of changes to the defaults; `sweep.py` varies one parameter at a time. There are four groups. `render`
-changes keywords of `ops.rasterize` (and the scalar and the degree of its tensors) on a trained run, `train` options or
-the photographs of a training, `extract` the method and the voxel size, `evaluate` the number of sample points of a
-score.
+changes keywords of `ops.rasterize`, the scalar type and the colour degree of the tensors, on a trained run. `train`
+changes the options or the photographs of a training. `extract` changes the method and the voxel size. `evaluate`
+changes the number of sample points of a score.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Value:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter. `errors` are keys of `ERRORS`: the first one that a scene allows decides, the others are reported
-    too."""
+    """A parameter. `errors` are keys of `ERRORS`: the first one that the scene allows gives the verdict; the others are
+    reported as well."""
 
     name: str
     title: str
@@ -199,8 +199,8 @@ def value_named(parameter: Parameter, name: str) -> Value:
 def settings(parameter: Parameter, value: Value) -> dict:
     """Return the setting that is measured for a value: the defaults of the parameter's group with its changes.
 
-    A setting that several parameters share is thus measured once. In the group `train` it holds only the differences
-    from the base, and is empty for the base itself.
+    A setting that several parameters share is therefore measured once. In the group `train` it holds only the
+    differences from the base training, and is empty for the base itself.
     """
     base = {"render": RENDER_DEFAULTS, "extract": EXTRACT_DEFAULTS, "evaluate": EVALUATE_DEFAULTS, "train": {}}[
         parameter.group

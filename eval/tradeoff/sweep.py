@@ -1,8 +1,8 @@
-"""Measures what accuracy costs in time on a scene: sweeps each parameter of `parameters.py` around the defaults.
+"""Measures accuracy against time on a scene: sweeps each parameter of `parameters.py` around the defaults.
 
 Writes `tradeoff.csv`, `tradeoff.json` and `tradeoff.html`. All settings of a group are timed in turn, round after
-round, so that other load on the machine affects all alike. A timing is the median of the rounds with its quartiles.
-Measurements are kept in `measured.json` of the folder, and reused.
+round, so that other load on the machine affects all of them alike. A timing is the median over the rounds, with
+quartiles. Measurements are kept in `measured.json` of the folder and reused.
 """
 
 from __future__ import annotations
@@ -100,8 +100,8 @@ def tradeoff(
 
 
 class Sweep:
-    """One folder of measurements. With an `executor`, trainings are its tasks, with `cores` threads each, and each
-    occupies `slot` of the executor's cores."""
+    """One folder of measurements. With an `executor`, trainings are its tasks; each has `cores` threads and occupies
+    `slot` of the executor's cores."""
 
     executor: Executor | None = None
     cores = slot = 1
@@ -159,7 +159,7 @@ class Sweep:
                 mine = [parameter for parameter in parameters if parameter.group == group]
                 if group in ("extract", "evaluate") and self.reference is None and mine:
                     self.progress.note(
-                        f"no reference mesh, so {', '.join(k.name for k in mine)}: time alone, or nothing"
+                        f"no reference mesh, so {', '.join(k.name for k in mine)}: time only, or no measurement"
                     )
                     if group == "evaluate":
                         continue

@@ -20,7 +20,7 @@ POINTS = 30_000
 
 
 class SurfaceScores:
-    """Scores of surfaces against a `reference` file, over the parts of both that training views see."""
+    """Scores surfaces against a `reference` file, over the parts of both that training views see."""
 
     def __init__(self, views: Sequence[View], reference: Path | None):
         self.views, self.reference = views, reference
