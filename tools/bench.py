@@ -1,13 +1,13 @@
 #!/usr/bin/env python3
-"""Times the rasterizer on a furnished room of N primitives made by code: ns per (pixel, primitive) hit, forward and
-backward, and what the core can do at that moment.
+"""Times the rasterizer on a procedural furnished room of N primitives, and the core's limits at the same time.
 
     python tools/bench.py --primitives 50000 --threads 1 --json
 
-Primitives are on the surfaces of a 6 x 3 x 5 m room with boxes and spheres. Their size is such that the number over a
-surface point does not depend on N. The camera looks in from the open front. Forward, backward and the limits alternate;
-results are medians. The limits are those of one thread and instruction set: peak multiply-adds, the vector exponential,
-and the bare pair kernels of octahedra with all data in the L1 cache and every pixel hit (csrc/raster/machine_limits.h).
+Times are ns per (pixel, primitive) hit, forward and backward. Primitives lie on the surfaces of a 6 x 3 x 5 m room with
+boxes and spheres. Their size is chosen such that the number over a point of the surface does not depend on N. The
+camera looks in from the open front. Forward, backward and the limits are measured alternately; results are medians. The
+limits are those of one thread and instruction set: peak multiply-adds, the vector exponential, and the bare pair
+kernels of octahedra with all data in the L1 cache and every pixel hit (csrc/raster/machine_limits.h).
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 
 
 def room(count: int, seed: int = 0, overlap: float = 0.60) -> dict[str, np.ndarray]:
-    """Return `count` flat octahedra on the room's surfaces: half-axes of 2.6 s in the surface with s = overlap
-    sqrt(area / count), and of 0.15 of that across."""
+    """Return `count` flat octahedra on the room's surfaces. With s = overlap sqrt(area / count), the half-axes are 2.6
+    s in the surface and 0.15 times that across it."""
     rng = np.random.default_rng(seed)
     walls: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
 
@@ -106,7 +106,8 @@ def median_spread(values: list[float]) -> dict[str, float]:
 def measure(
     count: int, threads: int, runs: int, geometry: bool, variant: dict[str, str], width: int = 800, height: int = 600
 ) -> dict:
-    """Time forward, backward, loss, optimiser and the machine's limits in turn, `runs` times after two warm-ups.
+    """Time forward, backward, loss, optimiser and the machine's limits alternately, `runs` times after two warm-up
+    runs.
 
     `variant` holds the keywords primitive, ray_model and order of `ops.rasterize`.
     """
@@ -195,8 +196,8 @@ def main() -> None:
     parser.add_argument("--primitive", choices=("octahedron", "tetrahedron", "gaussian"), default="octahedron")
     parser.add_argument("--ray-model", choices=("exact", "affine"), default="exact")
     parser.add_argument("--order", choices=("center", "entry", "overlap"), default="center")
-    parser.add_argument("--instruction-set", default="auto", help="scalar, v2, v3, v4 or neon; auto takes the best")
-    parser.add_argument("--geometry", action="store_true", help="also depths, normals, distortion")
+    parser.add_argument("--instruction-set", default="auto", help="scalar, v2, v3, v4 or neon; auto: the best one")
+    parser.add_argument("--geometry", action="store_true", help="also compute depths, normals and distortion")
     parser.add_argument("--json", action="store_true", help="print one JSON object (a list for several N)")
     args = parser.parse_args()
     from linprim_geo.kernels import ops

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Opens pages in a headless Chromium and fails on errors in the console, requests to elsewhere, and canvases that stay
-blank.
+"""Opens pages in a headless Chromium and reports console errors, requests to other hosts, and blank canvases.
 
 python tools/browser_check.py                       makes a tiny run, and checks its report and its view
 python tools/browser_check.py PAGE -o shot.png      checks a file or an address
 
-Wants Chromium (on Debian: apt-get install -y chromium) and, of Python, websockets.
+Exits with 1 if there is any fault. Needs Chromium (on Debian: apt-get install -y chromium) and the Python package
+websockets.
 """
 
 from __future__ import annotations
@@ -56,8 +56,7 @@ class Browser:
         program = next((found for name in BROWSERS if (found := shutil.which(name))), None)
         if program is None:
             raise SystemExit(
-                f"browser_check: no browser was found (tried {', '.join(BROWSERS)}); on Debian: apt-get install "
-                "-y chromium"
+                f"browser_check: no browser found (tried {', '.join(BROWSERS)}); on Debian: apt-get install -y chromium"
             )
         try:
             from websockets.sync.client import connect
@@ -129,7 +128,8 @@ class Browser:
         self.value("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def complaints(self, address: str) -> list[str]:
-        """Return errors of the console, exceptions, failed requests and requests to other hosts or files, so far."""
+        """Return errors of the console, exceptions, failed requests, and requests to other hosts or files, since the
+        page was opened."""
         self.value("1")
         home, found = urllib.parse.urlsplit(address), []
         for event in self.events:
@@ -149,9 +149,9 @@ class Browser:
                     home.scheme,
                     home.netloc,
                 ):
-                    found.append(f"request to elsewhere: {what['request']['url'][:120]}")
+                    found.append(f"request to another host: {what['request']['url'][:120]}")
                 elif home.scheme == "file" and asked.scheme == "file" and asked.path != home.path:
-                    found.append(f"request of another file: {what['request']['url'][:120]}")
+                    found.append(f"request for another file: {what['request']['url'][:120]}")
         return found
 
     def screenshot(self, whole: bool = False) -> bytes:
@@ -166,7 +166,7 @@ class Browser:
         return base64.b64decode(self.call("Page.captureScreenshot", **settings)["data"])
 
     def colors_of(self, element: int) -> int:
-        """Return the number of colours in the canvas of that number."""
+        """Return the number of colours in the canvas with that index."""
         import numpy as np
         from PIL import Image
 
@@ -216,15 +216,15 @@ def check(
     shot: Path | None = None,
     whole: bool = False,
 ) -> list[str]:
-    """Return the faults of a page: complaints, content wider than the window, blank canvases, or no canvas if `canvas`
-    requires one."""
+    """Return the faults of a page: complaints, content wider than the window, blank canvases, or a missing canvas if
+    `canvas` requires one."""
     opened.open(address, size, dark, seconds)
     found = []
     for element in range(opened.value("document.querySelectorAll('canvas').length")):
         if (colors := opened.colors_of(element)) < LEAST_COLORS:
             found.append(f"canvas {element} is blank: {colors} colours")
     if canvas and not opened.value("document.querySelectorAll('canvas').length"):
-        found.append("there is no canvas")
+        found.append("the page has no canvas")
     if (over := opened.value("document.documentElement.scrollWidth - window.innerWidth")) > 0:
         found.append(f"the page is {over} px wider than its window of {size[0]}")
     found += opened.complaints(address)
@@ -241,7 +241,7 @@ def use_viewer(opened: Browser) -> list[str]:
     before = opened.value(picture)
     opened.value(f"{canvas}.focus(); {canvas}.dispatchEvent(new KeyboardEvent('keydown', {{key: 'ArrowLeft'}}))")
     if (turned := opened.value(picture)) == before:
-        found.append("an arrow key does not turn the mesh")
+        found.append("an arrow key does not rotate the mesh")
     box = opened.value(
         f"(() => {{ const b = {canvas}.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }})()"
     )
@@ -249,14 +249,14 @@ def use_viewer(opened: Browser) -> list[str]:
         place = {"x": box[0] + shift, "y": box[1] + shift / 3}
         opened.call("Input.dispatchMouseEvent", type=kind, button="left", buttons=buttons, clickCount=1, **place)
     if (dragged := opened.value(picture)) == turned:
-        found.append("dragging does not turn the mesh")
+        found.append("dragging does not rotate the mesh")
     layers = opened.value("[...document.querySelectorAll('#view-layers input')].map(each => each.value)")
     seen = {dragged}
     for number in range(1, len(layers)):
         opened.value(f"document.querySelectorAll('#view-layers input')[{number}].click()")
         seen.add(opened.value(picture))
     if len(seen) != len(layers):
-        found.append(f"{len(layers)} ways to colour the mesh show {len(seen)} pictures")
+        found.append(f"{len(layers)} colourings of the mesh show {len(seen)} different images")
     return found
 
 
@@ -275,15 +275,19 @@ def check_report(opened: Browser, page: Path, folder: Path) -> list[str]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("page", nargs="?", help="file or address (default: a tiny run's report and view, made for it)")
+    parser.add_argument(
+        "page", nargs="?", help="file or address to check (default: report and view of a tiny run that is made first)"
+    )
     parser.add_argument(
         "-o",
         "--output",
         type=Path,
         default=Path("runs/browser_check"),
-        help="folder of screenshots, or .png of a page",
+        help="folder for screenshots, or .png file for a single page",
     )
-    parser.add_argument("--seconds", type=float, default=1.0, help="to wait after a page has loaded (default 1)")
+    parser.add_argument(
+        "--seconds", type=float, default=1.0, help="seconds to wait after a page has loaded (default 1)"
+    )
     args = parser.parse_args()
     with browser() as opened:
         if args.page is None:
@@ -317,7 +321,7 @@ def check_all(opened: Browser, folder: Path) -> list[str]:
 
 
 def check_view(opened: Browser, run: Path, reference: Path, folder: Path) -> list[str]:
-    """Check the view of a run: primitives, then its mesh by true error with all cameras."""
+    """Check the view of a run: its primitives, then its mesh coloured by true error with all cameras."""
     from linprim_geo.display.viewer import Viewer
 
     viewer = Viewer(run, 0, reference=reference)
@@ -328,7 +332,7 @@ def check_view(opened: Browser, run: Path, reference: Path, folder: Path) -> lis
         time.sleep(VIEW_SECONDS)
         (folder / "view_mesh.png").write_bytes(opened.screenshot())
         if (folder / "view_mesh.png").read_bytes() == (folder / "view.png").read_bytes():
-            found.append("the controls change nothing")
+            found.append("the controls do not change the image")
         return [f"view: {fault}" for fault in dict.fromkeys(found + opened.complaints(viewer.address))]
     finally:
         viewer.close()

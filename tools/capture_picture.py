@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The README's picture: held-out photographs of a run above its mesh, shaded and in the colours of the photographs.
+"""Makes the picture of the README: held-out photographs of a run, its mesh shaded, and its mesh in colours.
 
 python tools/capture_picture.py runs/temple docs/images/capture_to_mesh.jpg --turn 1 --crop 100 0 600 480
 """
@@ -56,7 +56,7 @@ def _cropped(image: np.ndarray, crop: list[int] | None) -> np.ndarray:
 
 
 def _joined(parts: list[np.ndarray], axis: int) -> np.ndarray:
-    """Return images next to or above each other, with a white gap in between."""
+    """Return images side by side or stacked, with a white gap between them."""
     shape = list(parts[0].shape)
     shape[axis] = GAP_PX
     gap = np.full(shape, 255, np.uint8)
@@ -68,11 +68,17 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of a trained and meshed run")
-    parser.add_argument("output", type=Path, help=".jpg to write")
-    parser.add_argument("--views", type=int, nargs="+", default=[2, 3, 0], help="which held-out views (default 2 3 0)")
-    parser.add_argument("--height", type=int, default=230, help="pixels of each picture (default 230)")
-    parser.add_argument("--turn", type=int, default=0, metavar="K", help="quarter turns to the left (default 0)")
-    parser.add_argument("--crop", type=int, nargs=4, metavar="PX", help="left top right bottom of each photograph")
+    parser.add_argument("output", type=Path, help=".jpg file to write")
+    parser.add_argument(
+        "--views", type=int, nargs="+", default=[2, 3, 0], help="indices of the held-out views to show (default 2 3 0)"
+    )
+    parser.add_argument("--height", type=int, default=230, help="height of each image in pixels (default 230)")
+    parser.add_argument(
+        "--turn", type=int, default=0, metavar="K", help="rotate images by K quarter turns to the left (default 0)"
+    )
+    parser.add_argument(
+        "--crop", type=int, nargs=4, metavar="PX", help="show only this part of each photograph: left top right bottom"
+    )
     args = parser.parse_args()
     Image.fromarray(picture(args.run, args.views, args.height, args.turn, args.crop)).save(args.output, quality=QUALITY)
 

@@ -1,7 +1,7 @@
-"""Checks that packages import only packages below them, and that there are no import cycles.
+"""Checks that packages only import packages below them, and that there are no import cycles.
 
-The order is in pyproject.toml, `[tool.importlinter]`. In the repository `linprim_geo.eval` is in `eval/`, so the
-package is first assembled in a temporary folder, as in the wheel. Imports inside functions count.
+The order is in pyproject.toml, `[tool.importlinter]`. Because `linprim_geo.eval` is in `eval/` of the repository, the
+package is first assembled in a temporary folder, as in the wheel. Imports inside functions are checked, too.
 """
 
 from __future__ import annotations

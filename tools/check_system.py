@@ -1,8 +1,7 @@
-"""Checks, before anything is installed, that this machine can build and run linprim-geo.
+"""Checks that this machine can build and run linprim-geo, before anything is installed.
 
-Prints nothing and exits with 0 if all requirements are met. Missing shared libraries are installed if this runs as
-root on a system with apt-get; otherwise the command to run is printed and the exit status is 1. Uses the standard
-library only.
+Prints nothing and exits with 0 if all requirements are met. Missing shared libraries are installed if this runs as root
+on a system with apt-get; otherwise it prints the command to run and exits with 1. Uses the standard library only.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from pathlib import Path
 
 
 def load_system():
-    """Return linprim_geo/base/system.py, loaded by its path, as the package cannot be imported without its
-    dependencies."""
+    """Return the module linprim_geo/base/system.py, loaded by its path, because the package cannot be imported without
+    its dependencies."""
     path = Path(__file__).resolve().parent.parent / "linprim_geo" / "base" / "system.py"
     spec = importlib.util.spec_from_file_location("linprim_geo_system", path)
     module = importlib.util.module_from_spec(spec)

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""Builds the sdist and, from it, the wheel; installs the wheel into a fresh environment and runs it there: `python
-tools/check_wheel.py`.
+"""Builds the sdist and from it the wheel, installs the wheel into a fresh environment and runs it there.
+
+    python tools/check_wheel.py
 
 The wheel is checked for its required content. Then commands from `doctor` to `report` run in a separate folder, with a
-PATH without a compiler. --python selects the interpreter (from 3.12 on the wheel also works with every later Python),
---output keeps the two files; otherwise nothing is left. Downloads the libraries of constraints.txt; takes several
+PATH that has no compiler. --python selects the interpreter (from 3.12 on the wheel also works with every later Python).
+--output keeps the two files; otherwise nothing is kept. Downloads the libraries of constraints.txt and takes several
 minutes. Exit status: 0, or 1 with one sentence about the first failure.
 """
 
@@ -66,8 +67,8 @@ def build(python: Path, output: Path) -> tuple[Path, Path]:
 
 
 def check_contents(wheel: Path) -> int:
-    """Check that every file of the packages except STUDIES is in the wheel, and the core, the entry point and the
-    licence; return the number of files."""
+    """Check that the wheel has every file of the packages except STUDIES, the core, the entry point and the licence;
+    return the number of files."""
     packed = set(zipfile.ZipFile(wheel).namelist())
     for source, target in PACKAGES.items():
         for file in (ROOT / source).rglob("*"):
@@ -87,7 +88,8 @@ def check_contents(wheel: Path) -> int:
 
 
 def check_tag(python: Path, wheel: Path) -> None:
-    """Check that the wheel has the stable ABI from Python 3.12 on."""
+    """Check the tag of the wheel: the stable ABI if it is built with Python 3.12 or later, else the ABI of that
+    version."""
     minor = int(run(python, "-c", "import sys; print(sys.version_info.minor)"))
     wanted = "-cp312-abi3-" if minor >= 12 else f"-cp3{minor}-cp3{minor}-"
     if wanted not in wheel.name:
@@ -95,7 +97,7 @@ def check_tag(python: Path, wheel: Path) -> None:
 
 
 def smoke(python: Path, folder: Path) -> None:
-    """Run the installed package in `folder`, outside of the repository and without a compiler."""
+    """Run the installed package in `folder`, outside of the repository and without a compiler in PATH."""
     binary = python.parent
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "CC", "CXX")}
     environment |= {"PATH": str(binary), "LINPRIM_GEO_CACHE": str(folder / "cache")}
@@ -118,8 +120,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description="Builds sdist and wheel, installs the wheel into a fresh environment and runs it."
     )
-    parser.add_argument("--python", default=sys.executable, metavar="PROGRAM", help="interpreter (default: this one)")
-    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="keep the two files here")
+    parser.add_argument(
+        "--python", default=sys.executable, metavar="PROGRAM", help="Python interpreter to use (default: this one)"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder in which to keep the sdist and the wheel"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="linprim-geo-wheel-") as temporary:
         folder = Path(temporary)

@@ -1,15 +1,15 @@
 #!/usr/bin/env python3
-"""Compares two installed versions over scenes and seeds: is anything worse than the scatter of its seeds?
+"""Compares two installed versions over scenes and seeds, and reports scores that are worse beyond the scatter of seeds.
 
     python tools/compare_versions.py --before OLD/.venv/bin/linprim-geo --after .venv/bin/linprim-geo \\
         --scene office=DIR:REFERENCE --scene banana=DIR -o runs/compare --iterations 2000
 
-Each version trains each scene with each seed. If a reference mesh is given, the mesh is extracted too, and both are
-scored by the later version's `eval-mesh --run`. Results in the output folder for the same number of steps are reused,
-so a comparison can be interrupted; use another folder for another pair of versions. `compare.md` and `compare.json`
-hold means over the seeds with standard deviations: PSNR of held-out photographs in dB, and Chamfer distance and normal
-consistency of the visible part, in % of the diagonal and as a cosine. A score counts as worse if it is worse by more
-than twice the standard deviation of the difference of both means.
+Each version trains each scene with each seed. If a reference mesh is given, the mesh is extracted too, and both
+versions' meshes are scored by `eval-mesh --run` of the later version. Results in the output folder for the same number
+of steps are reused, so a comparison can be interrupted; use another folder for another pair of versions. `compare.md`
+and `compare.json` hold means over the seeds with standard deviations: PSNR of held-out photographs in dB, Chamfer
+distance of the visible part in % of the diagonal, and normal consistency of the visible part, a cosine. A score counts
+as worse if it is worse by more than twice the standard deviation of the difference of the means.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import write_json
 from linprim_geo.eval.study_tables import write_table
 
-# By name of the score: heading, decimals, whether larger is better.
+# For each score: heading, decimals, whether larger is better.
 FIGURES = {
     "psnr": ("held out, dB", 2, True),
     "chamfer": ("Chamfer, %", 3, False),
@@ -63,7 +63,7 @@ def run_json(command: list, log: Path) -> dict:
 
 
 def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterations: int, folder: Path) -> dict:
-    """Return the scores of one version, scene and seed, from `folder`/figures.json if that exists."""
+    """Return the scores of one version, scene and seed; they are read from `folder`/figures.json if that exists."""
     kept = folder / "figures.json"
     if kept.exists():
         return json.loads(kept.read_text(encoding="utf-8"))
@@ -86,7 +86,7 @@ def measure(program: Path, ruler: Path, scene: SceneToCompare, seed: int, iterat
 
 
 def row(scene: str, name: str, before: list[float], after: list[float]) -> dict:
-    """Return means and deviations of one score, and whether the change for the worse exceeds their scatter."""
+    """Return means and standard deviations of one score, and whether it is worse by more than their scatter."""
     means = np.mean(before), np.mean(after)
     deviations = [float(np.std(values, ddof=1)) for values in (before, after)]
     loss = (means[0] - means[1]) * (1 if FIGURES[name][2] else -1)
@@ -113,11 +113,19 @@ def table(rows: list[dict]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--before", type=Path, required=True, metavar="PROGRAM", help="the earlier linprim-geo")
-    parser.add_argument("--after", type=Path, required=True, metavar="PROGRAM", help="the later one, also the ruler")
+    parser.add_argument(
+        "--before", type=Path, required=True, metavar="PROGRAM", help="linprim-geo of the earlier version"
+    )
+    parser.add_argument(
+        "--after",
+        type=Path,
+        required=True,
+        metavar="PROGRAM",
+        help="linprim-geo of the later version, which also scores the meshes",
+    )
     parser.add_argument("--scene", action="append", required=True, metavar="NAME=FOLDER[:REFERENCE]")
-    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="seeds 0 to N - 1 (default 3)")
-    parser.add_argument("--iterations", type=int, default=7000, metavar="N", help="steps of training (default 7000)")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N", help="number of seeds, 0 to N - 1 (default 3)")
+    parser.add_argument("--iterations", type=int, default=7000, metavar="N", help="training steps (default 7000)")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR")
     chosen = parser.parse_args()
     try:

@@ -1,12 +1,12 @@
-"""Damaged inputs for every reader: each must be read correctly or refused with one sentence, in bounded time and
-memory.
+"""Feeds damaged inputs to every reader, and reports those that are neither read correctly nor rejected properly.
 
     python tools/fuzz.py --inputs 100000 --seed 0
-    python tools/fuzz.py --only "mesh glb" --seed 0 --at 123      one input again, with its traceback; its file is kept
+    python tools/fuzz.py --only "mesh glb" --seed 0 --at 123      repeats one input, with its traceback; keeps its file
 
-An input is a valid file damaged by mutations drawn from (seed, reader, number). Readers run in a separate process that
-may allocate 192 MiB more than it has, and that is restarted after a crash. Every input is written to disk before it is
-tried. Exit status 1 if there is a finding.
+A reader has to read an input or reject it with one sentence, in bounded time and memory. An input is a valid file with
+mutations drawn from (seed, reader, number). Readers run in a separate process that may allocate 192 MiB in addition to
+what it has, and that is restarted after a crash. Every input is written to disk before it is read. Exit status 1 if
+there is a finding.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from pathlib import Path
 
 import numpy as np
 
-# Seconds on an idle machine after which reading one small file counts as a hang, bytes that it may allocate, and the
-# largest length of an error message.
+# Limits for reading one small file: seconds on an idle machine until it counts as a hang, bytes that it may allocate,
+# and the length of an error message.
 HANG, MEMORY, LONGEST = 5.0, 192 * 2**20, 2000
 # Seconds without progress after which a process that does not react to its alarm is killed.
 STUCK = 30.0
@@ -65,7 +65,7 @@ class Case:
 
 
 def attempt(case: Case, path: Path) -> tuple[str, str]:
-    """Return (read, refused or the name of a finding, the message)."""
+    """Return (outcome, message): the outcome is "read", "refused" or the name of a finding."""
     from linprim_geo.base.errors import LinprimError
 
     signal.setitimer(signal.ITIMER_REAL, _on_this_machine(HANG))
@@ -96,7 +96,7 @@ def _place(trace) -> str:
 
 
 def _on_this_machine(seconds: float) -> float:
-    """Convert seconds on an idle machine to this machine, whose cores may each run several processes."""
+    """Convert seconds on an idle machine to seconds on this machine, whose cores may each run several processes."""
     from linprim_geo.base.cores import usable_cores
 
     return seconds * max(1.0, os.getloadavg()[0] / usable_cores())
@@ -107,8 +107,8 @@ def _alarm(*_):
 
 
 def work(names: list[str], counts: list[int], seed: int, start: int, folder: Path) -> None:
-    """Read inputs, from `start` of the first reader on, in the reading process; counts and findings are written to a
-    file in `folder`."""
+    """Read inputs in the reading process, from `start` of the first reader on, and write counts and findings to a file
+    in `folder`."""
     import resource
 
     _prepare(folder)
@@ -164,7 +164,7 @@ def _case(name: str, folder: Path) -> Case:
 
 
 def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[str, dict]:
-    """Return {reader: read, refused, and a list of findings}, from as many successive processes as are needed."""
+    """Return {reader: read, refused, list of findings}, from as many successive processes as crashes require."""
     table = {
         name: {"inputs": count, "read": 0, "refused": 0, "findings": []}
         for name, count in zip(names, counts, strict=True)
@@ -205,7 +205,7 @@ def run(names: list[str], counts: list[int], seed: int, folder: Path) -> dict[st
 
 
 def _watch(process: subprocess.Popen, current: Path) -> int:
-    """Wait for the process, and kill it if it makes no more progress; return its status."""
+    """Wait for the process, kill it if it makes no progress, and return its status."""
     while True:
         try:
             return process.wait(timeout=1.0)
@@ -216,7 +216,7 @@ def _watch(process: subprocess.Popen, current: Path) -> int:
 
 
 def show(table: dict[str, dict]) -> str:
-    """Return the table and below it every distinct finding with the first input that shows it."""
+    """Return the table, followed by each distinct finding with the first input that shows it."""
     lines = [f"{'reader':18}{'inputs':>9}{'refused':>9}{'read':>9}{'findings':>10}"]
     for name, row in table.items():
         lines.append(f"{name:18}{row['inputs']:9}{row['refused']:9}{row['read']:9}{len(row['findings']):10}")
@@ -252,10 +252,12 @@ def main() -> int:
     from fuzz_readers import READERS
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--inputs", type=int, default=100_000, help="in all, over all readers (default 100000)")
+    parser.add_argument(
+        "--inputs", type=int, default=100_000, help="total number of inputs, over all readers (default 100000)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=[reader.name for reader in READERS], help="one reader")
-    parser.add_argument("--at", type=int, help="with --only: this input alone, here")
+    parser.add_argument("--at", type=int, help="with --only: read only this input, in this process")
     parser.add_argument("--work", nargs=5, help=argparse.SUPPRESS)
     parsed = parser.parse_args()
     if parsed.work:

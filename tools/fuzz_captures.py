@@ -1,4 +1,4 @@
-"""Valid captures, protocol files and runs for the fuzzer, and checks of the results of reading them."""
+"""Makes valid captures, protocol files and runs for the fuzzer, and checks what the readers return for them."""
 
 from __future__ import annotations
 

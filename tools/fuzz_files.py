@@ -1,4 +1,5 @@
-"""Valid files of primitives, points, meshes and images for the fuzzer, and checks of the results of reading them."""
+"""Makes valid files of primitives, points, meshes and images for the fuzzer, and checks what the readers return for
+them."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 
 
 class Wrong(AssertionError):
-    """A result of a reader that is not finite or not consistent."""
+    """A reader returned a result that is not finite or not consistent."""
 
 
 def check(condition: bool, what: str) -> None:

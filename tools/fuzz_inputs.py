@@ -1,5 +1,4 @@
-"""Damages valid inputs by seeded mutations of bytes, of text, of JSON, and of formats protected by checksums or
-lengths."""
+"""Damages valid inputs by seeded mutations of bytes, text, JSON, and formats with checksums or lengths."""
 
 from __future__ import annotations
 
@@ -172,7 +171,7 @@ def _span(rng: np.random.Generator, size: int) -> tuple[int, int]:
 
 
 def _number(rng: np.random.Generator) -> bytes:
-    """Return an unusual number in binary, of random type and byte order."""
+    """Return the bytes of an unusual number, of random type and byte order."""
     order = _pick(rng, "<>")
     if rng.random() < 0.5:
         code = _pick(rng, "fd")
@@ -273,8 +272,8 @@ def _change(rng: np.random.Generator, value) -> None:
 
 
 def _zip(rng: np.random.Generator, data: bytes) -> bytes:
-    """Change, remove, duplicate or rename members, with valid checksums; arrays are also mutated as such, other members
-    as bytes."""
+    """Change, remove, duplicate or rename members, with valid checksums. Arrays are mutated as arrays, other members as
+    bytes."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [(info.filename, archive.read(info)) for info in archive.infolist()]
@@ -324,7 +323,8 @@ def _enormous_header(rng: np.random.Generator) -> bytes:
 
 
 def _npy(rng: np.random.Generator, content: bytes) -> bytes:
-    """Return an array of another type, shape or values, or with a header that only declares so."""
+    """Return an array with another type, shape or values, or with a header that declares these without changing the
+    data."""
     try:
         array = np.load(io.BytesIO(content), allow_pickle=False)
         array = array if array.dtype.kind in "fiub" else array.astype("<U30")

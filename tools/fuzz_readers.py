@@ -1,4 +1,4 @@
-"""All readers of the package for the fuzzer: valid inputs, the files to damage with their kinds, and checks of the
+"""Lists all readers of the package for the fuzzer: valid inputs, the files to damage with their kinds, and checks of
 results."""
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import fuzz_files as files
 
 @dataclass(frozen=True)
 class Reader:
-    """`make` writes valid inputs to a folder; `files` are those that are damaged, each with its kind of mutation;
-    `read` reads the input that one of them belongs to, and checks the result."""
+    """`make` writes valid inputs to a folder. `files` are those to damage, each with its kind of mutation. `read` reads
+    the input to which a damaged file belongs, and checks the result."""
 
     name: str
     make: Callable[[Path], None]

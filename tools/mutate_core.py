@@ -1,12 +1,12 @@
-"""Shows that the tests notice wrong code in the C++ core: `python tools/mutate_core.py`.
+"""Checks that the tests detect wrong code in the C++ core: `python tools/mutate_core.py`.
 
-Builds a copy of the core with one wrong line at a time (a mutation), puts that module in the place of the installed one
-and runs the test files that cover the line, up to the first failure. A mutation that no test notices `SURVIVED`. The
-real sources are never written to. Exit status: 1 where a mutation survives, 2 where the tests fail without one.
+Builds a copy of the core with one wrong line at a time (a mutation), uses it in place of the installed one, and runs
+the test files that cover the line until the first failure. A mutation that no test detects is reported as `SURVIVED`.
+The real sources are never changed. Exit status: 1 if a mutation survives, 2 if the tests fail without a mutation.
 
-The copy has the kernels for AVX2 and, in double precision only, the scalar ones, without the compiler's slower
-optimisations: a third of the time to compile. No mutation of the list leaves all results as they are.
-Takes an x86-64 processor with AVX2, the environment that `make env` makes, and half an hour.
+To compile in a third of the time, the copy has only the kernels for AVX2 and, in double precision, the scalar ones, and
+is built without the compiler's slower optimisations. Every mutation in the list changes some result. Needs an x86-64
+processor with AVX2, the environment of `make env`, and half an hour.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sanitize import ROOT, build, run_pytest
 
 from linprim_geo.base.cores import usable_cores
 
-# Seconds after which tests on a mutated core are stopped, which counts as noticing the mutation.
+# Seconds after which tests on a mutated core are stopped, which counts as detecting the mutation.
 PATIENCE = 900
 
 
@@ -248,7 +248,8 @@ def edited(text: str, edit: Edit, what: str) -> str:
 
 
 def write_if_changed(path: Path, text: str) -> None:
-    """Write a file only if its text differs, so that unchanged files keep their time and are not compiled again."""
+    """Write a file only if its text differs, so that unchanged files keep their modification time and are not
+    recompiled."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists() or path.read_text() != text:
         path.write_text(text)
@@ -280,7 +281,7 @@ class Copy:
             raise SystemExit(f"mutate_core: the build failed:\n{error.stdout[-3000:]}{error.stderr[-3000:]}") from None
 
     def first_failure(self, module: Path, tests: Sequence[str]) -> str | None:
-        """Return the first failing test of these files, or another cause of their end; None if all pass."""
+        """Return the first failing test of these files, or the reason if they end otherwise; None if all pass."""
         arguments = [
             "-x",
             "-q",
@@ -293,7 +294,7 @@ class Copy:
         try:
             done = run_pytest(module, self.folder, arguments, {}, capture_output=True, text=True, timeout=PATIENCE)
         except subprocess.TimeoutExpired:
-            return f"no end within {PATIENCE} s"
+            return f"not finished within {PATIENCE} s"
         (self.folder / "tests.log").write_text(done.stdout + done.stderr)
         if done.returncode == 0:
             return None
@@ -305,7 +306,7 @@ class Copy:
         raise SystemExit(f"mutate_core: pytest did not run:\n{(done.stdout + done.stderr)[-3000:]}")
 
     def noticed_by(self, mutation: Mutation) -> str | None:
-        """Return the test that fails with the mutation; None if it survives."""
+        """Return the test that fails with the mutation, or None if it survives."""
         file = mutation.edit.file
         path = self.source / file
         path.write_text(edited(self.text[file], mutation.edit, file))
@@ -318,11 +319,13 @@ class Copy:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="build here and leave it (default: a temporary folder)"
+        "--keep", type=Path, metavar="FOLDER", help="build in this folder and keep it (default: a temporary folder)"
     )
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="compilers at once (default: %(default)s)")
-    parser.add_argument("--only", action="append", metavar="NAME", choices=MUTATIONS, help="this one; may be repeated")
-    parser.add_argument("--list", action="store_true", help="only lists the mutations")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="parallel compile jobs (default: %(default)s)")
+    parser.add_argument(
+        "--only", action="append", metavar="NAME", choices=MUTATIONS, help="run only this mutation; may be repeated"
+    )
+    parser.add_argument("--list", action="store_true", help="list the mutations and exit")
     options = parser.parse_args(arguments)
     chosen = {name: MUTATIONS[name] for name in options.only or MUTATIONS}
     if options.list:
@@ -333,7 +336,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     os.environ.pop("LINPRIM_GEO_ISA", None)
     if ops.instruction_set() not in ("v3", "v4"):
-        print("mutate_core: this processor has no AVX2, whose kernels are what is built here", file=sys.stderr)
+        print("mutate_core: this processor has no AVX2, for which the kernels are built", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory(prefix="linprim-mutate-") as temporary:
         folder = options.keep.resolve() if options.keep else Path(temporary)
@@ -341,9 +344,9 @@ def main(arguments: list[str] | None = None) -> int:
         copy = Copy(folder, options.jobs)
         failure = copy.first_failure(copy.build(), sorted({t for m in chosen.values() for t in m.tests}))
         if failure:
-            print(f"mutate_core: without a mutation this fails: {failure}", file=sys.stderr)
+            print(f"mutate_core: a test fails without a mutation: {failure}", file=sys.stderr)
             return 2
-        print(f"{'no mutation':30} {time.monotonic() - begin:4.0f} s  the tests pass", flush=True)
+        print(f"{'no mutation':30} {time.monotonic() - begin:4.0f} s  all tests pass", flush=True)
         noticed = 0
         for name, mutation in chosen.items():
             begin = time.monotonic()
@@ -351,7 +354,7 @@ def main(arguments: list[str] | None = None) -> int:
             noticed += failure is not None
             said = f"killed by {failure}" if failure else "SURVIVED"
             print(f"{name:30} {time.monotonic() - begin:4.0f} s  {said}", flush=True)
-    print(f"{noticed} of {len(chosen)} mutations are noticed")
+    print(f"{noticed} of {len(chosen)} mutations are detected")
     return int(noticed < len(chosen))
 
 

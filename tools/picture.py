@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The picture of a run: held-out photographs beside the render, its depth and normals, and the extracted mesh.
+"""Makes a picture of a run: held-out photographs, renders, depth, normals and the extracted mesh side by side.
 
 python tools/picture.py runs/demo/run docs/images/demo.png
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def picture(run_path: Path, views: list[int], mesh_path: Path | None) -> np.ndarray:
-    """Return photograph, render, median depth, normal and shaded mesh (5 columns, a row per view) as (H, W, 3)
+    """Return photograph, render, median depth, normals and shaded mesh (5 columns, one row per view) as (H, W, 3)
     uint8."""
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.imaging.colors import depth_preview
@@ -50,8 +50,10 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of a trained and meshed run")
-    parser.add_argument("output", type=Path, help=".png to write")
-    parser.add_argument("--views", type=int, nargs="+", default=[1, 5], help="which held-out views (default 1 5)")
+    parser.add_argument("output", type=Path, help=".png file to write")
+    parser.add_argument(
+        "--views", type=int, nargs="+", default=[1, 5], help="indices of the held-out views to show (default 1 5)"
+    )
     parser.add_argument("--mesh", type=Path, help="mesh to show (default RUN/mesh/tsdf/mesh.ply)")
     args = parser.parse_args()
     Image.fromarray(picture(args.run, args.views, args.mesh)).save(args.output)

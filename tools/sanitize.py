@@ -1,9 +1,9 @@
-"""Runs the core's tests under AddressSanitizer and UndefinedBehaviorSanitizer: `python tools/sanitize.py`.
+"""Runs the tests of the core under AddressSanitizer and UndefinedBehaviorSanitizer: `python tools/sanitize.py`.
 
-Builds the core with -DLINPRIM_SANITIZE=ON in a folder of its own (--keep FOLDER to build again faster next time), puts
-that module in the place of the installed one, and runs pytest with the sanitizers' runtimes preloaded. The first error
-ends the run. Exit status: pytest's, or 1 where the build fails or a sanitizer has spoken. Takes GCC or Clang on Linux,
-several minutes, and the environment that `make env` makes.
+Builds the core with -DLINPRIM_SANITIZE=ON in a separate folder (with --keep FOLDER later builds are faster), uses that
+module in place of the installed one, and runs pytest with the sanitizers' runtimes preloaded. The first error ends the
+run. Exit status: that of pytest, or 1 if the build fails or a sanitizer reports an error. Needs GCC or Clang on Linux,
+the environment of `make env`, and several minutes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TESTS = (
     "eval/test_stability.py",
     "kernels/test_photometric.py",
 )
-# `opcheck` traces with a compiler of its own, and a forked child has none of the sanitizers' threads.
+# `opcheck` uses its own compiler for tracing, and a forked child lacks the sanitizers' threads.
 SKIPPED = "not registered_correctly and not forked"
 
 # Loads the module built here under the installed one's name before anything imports the package: the finder of an
@@ -56,8 +56,8 @@ sys.exit(pytest.main(sys.argv[2:]))
 
 
 def build(folder: Path, jobs: int, options: list[str], source: Path = ROOT, **how: Any) -> Path:
-    """Build the core of `source` in `folder` with these options of CMake; return the module. `how` is passed to
-    subprocess.run. Raises CalledProcessError if that fails."""
+    """Build the core of `source` in `folder` with these CMake options; return the module. `how` is passed to
+    subprocess.run. Raises CalledProcessError if the build fails."""
     python = sys.executable
     nanobind = subprocess.run(
         [python, "-m", "nanobind", "--cmake_dir"], check=True, capture_output=True, text=True
@@ -77,7 +77,7 @@ def build(folder: Path, jobs: int, options: list[str], source: Path = ROOT, **ho
 
 def runtimes(folder: Path) -> str:
     """Return LD_PRELOAD with the sanitizers' runtimes of the compiler that built `folder`, and the C++ library that
-    they hook into."""
+    they intercept."""
     cache = (folder / "CMakeCache.txt").read_text()
     compiler = next(line.split("=", 1)[1] for line in cache.splitlines() if line.startswith("CMAKE_CXX_COMPILER:"))
     names = ("libasan.so", "libubsan.so", "libstdc++.so.6")
@@ -96,8 +96,8 @@ def runtimes(folder: Path) -> str:
 
 
 def run_pytest(module: Path, folder: Path, arguments: list[str], environment: dict[str, str], **how: Any) -> Any:
-    """Run pytest with `module` in place of the installed core; return the result of subprocess.run. The program for
-    this is written to `folder`."""
+    """Run pytest with `module` in place of the installed core, by a program that is written to `folder`. Return the
+    result of subprocess.run."""
     environment = os.environ | environment
     environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
     environment.setdefault("OMP_NUM_THREADS", "1")
@@ -110,7 +110,7 @@ def test(module: Path, folder: Path, arguments: list[str]) -> int:
     """Run pytest on the module under the sanitizers; return its exit status."""
     environment = {
         "LD_PRELOAD": runtimes(folder),
-        # Python does not free all memory at exit, so leaks mean nothing; threads of torch outlive their stacks.
+        # Python does not free all memory at exit, so leaks are ignored; threads of torch outlive their stacks.
         "ASAN_OPTIONS": "detect_leaks=0:halt_on_error=1:abort_on_error=0:exitcode=99:detect_stack_use_after_return=0",
         "UBSAN_OPTIONS": "halt_on_error=1:print_stacktrace=1:exitcode=99",
     }
@@ -120,13 +120,13 @@ def test(module: Path, folder: Path, arguments: list[str]) -> int:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--keep", type=Path, metavar="FOLDER", help="build here and leave it (default: a temporary folder)"
+        "--keep", type=Path, metavar="FOLDER", help="build in this folder and keep it (default: a temporary folder)"
     )
-    parser.add_argument("--jobs", type=int, default=usable_cores(), help="compilers at once (default: %(default)s)")
-    parser.add_argument("pytest", nargs="*", help="arguments of pytest in place of the core's test files, after --")
+    parser.add_argument("--jobs", type=int, default=usable_cores(), help="parallel compile jobs (default: %(default)s)")
+    parser.add_argument("pytest", nargs="*", help="arguments for pytest after --, in place of the core's test files")
     options = parser.parse_args(arguments)
     if not sys.platform.startswith("linux"):
-        print("sanitize: this preloads the sanitizers the way of Linux only", file=sys.stderr)
+        print("sanitize: works on Linux only, as the sanitizers are preloaded by LD_PRELOAD", file=sys.stderr)
         return 1
     chosen = options.pytest or [
         *(str(ROOT / "tests" / t) for t in TESTS),
