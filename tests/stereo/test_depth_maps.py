@@ -1,4 +1,4 @@
-"""Depth maps of several photographs: of a wall whose depth and normal are known, and the steps that lead to them."""
+"""Depth maps of several photographs of a wall with known depth and normal, and single steps of their computation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def depth_of(camera: Camera) -> np.ndarray:
 
 
 def wall_view(center, contrast: float = 55.0, noise: float = 0.0) -> SimpleNamespace:
-    """A photograph of the wall, with waves of 4 to 15 pixels on it; `contrast` and `noise` are standard deviations."""
+    """Photograph of the wall, textured by waves of 4 to 15 pixels; `contrast` and `noise` are standard deviations."""
     camera = look_at(center, size=(96, 72), focal=110.0, up=(0.0, 1.0, 0.0))
     points = camera.center + camera.world_rays() * depth_of(camera)[..., None]
     rng = np.random.default_rng(1)
@@ -55,22 +55,22 @@ def wall_points(views) -> np.ndarray:
     return (camera.center + camera.world_rays() * depth_of(camera)[..., None])[::5, ::5].reshape(-1, 3)
 
 
-def test_a_wall_is_where_it_is_and_neighbours_confirm_it(views, wall_points):
+def test_depths_and_normals_of_a_wall_are_accurate_and_confirmed(views, wall_points):
     maps = depth_maps(views, wall_points)
     first = maps[0]
     inside = np.s_[10:-10, 10:-10]
     error = np.abs(first.depth / depth_of(first.camera) - 1)[inside]
     # A pixel of disparity is 3 / (110 * 0.5) = 5 % of the depth; a tenth of one is expected of windows of 11 pixels.
-    assert np.nanmedian(error) < 0.002 and (error < 0.01).mean() > 0.97  # a few are not known
+    assert np.nanmedian(error) < 0.002 and (error < 0.01).mean() > 0.97  # NaN counts as wrong
     assert first.is_confirmed()[inside].mean() > 0.95
-    # Towards the camera, and the wall's: a window's depth changes by a tenth of a pixel within 5 of them.
+    # Normals point to the camera. A tenth of a pixel of disparity over 5 pixels of a window bounds their error.
     angle = np.degrees(np.arccos(np.clip(-first.normal[inside] @ NORMAL, -1, 1)))
     assert np.median(angle) < 5
     for found, view in zip(maps, views, strict=True):
         np.testing.assert_array_equal(found.colours, colours_of(view.load().rgb))
 
 
-def test_texture_that_noise_nearly_hides_is_known_and_confirmed(wall_points):
+def test_depths_of_weak_texture_in_noise_are_confirmed_and_accurate(wall_points):
     maps = depth_maps([wall_view(center, contrast=6.0, noise=3.0) for center in CENTERS], wall_points)
     first = maps[0]
     inside = np.s_[10:-10, 10:-10]
@@ -83,34 +83,34 @@ def test_texture_that_noise_nearly_hides_is_known_and_confirmed(wall_points):
     assert np.median(angle) < 3
 
 
-def test_what_photographs_share_bounds_their_noise(views, wall_points):
-    """Waves of 4 to 15 pixels all over, and noise with a variance of 4 at most."""
+def test_noise_is_bounded_by_differences_between_photographs(views, wall_points):
+    """Texture covers the whole image, so that its plainest parts seem to have more noise than the variance of 4."""
     for found in depth_maps([wall_view(center, contrast=30.0, noise=2.0) for center in CENTERS], wall_points):
         assert 4 < found.most_noise < 9 and found.noise == min(found.most_noise, noise_of(found.grey))
-    # Behind everything else, and so in no photograph's sight.
+    # A photograph from behind the wall shares no points with the others.
     lonely = depth_maps([*views, wall_view((0, 0, 3))], wall_points)[-1]
     assert lonely.most_noise == np.inf and lonely.noise == noise_of(lonely.grey)
 
 
-def test_views_that_share_nothing_are_one_sentence(views):
+def test_views_without_common_points_are_refused(views):
     behind = np.array([[0.0, 0.0, -50.0]])
     with pytest.raises(LinprimError, match="stereo needs such pairs"):
         depth_maps(views, behind)
 
 
-def test_what_does_not_fit_into_memory_is_one_sentence(views, wall_points, monkeypatch):
+def test_photographs_that_exceed_memory_are_refused(views, wall_points, monkeypatch):
     monkeypatch.setattr("linprim_geo.stereo.depth_maps.available_memory", lambda: 2**20)
     with pytest.raises(LinprimError, match="5 photographs takes 0.0 GiB of the 0.0 that are free"):
         depth_maps(views, wall_points)
 
 
-def test_photographs_smaller_than_a_window_are_one_sentence():
+def test_photographs_smaller_than_a_window_are_refused():
     small = [SimpleNamespace(camera=look_at(center, size=(40, 20), up=(0.0, 1.0, 0.0))) for center in CENTERS]
     with pytest.raises(LinprimError, match="24 pixels a side"):
         depth_maps(small, np.zeros((9, 3)))
 
 
-def test_planes_of_half_the_size_are_those_of_the_whole(views):
+def test_planes_of_half_size_are_upsampled_exactly(views):
     image = StereoImage.of(views[0].camera, np.zeros((72, 96), np.uint8))
     half = halved(image)
     inverse = 1 / depth_of(half.camera)
@@ -122,10 +122,10 @@ def test_planes_of_half_the_size_are_those_of_the_whole(views):
     assert np.allclose(fine[..., 1], np.gradient(wanted, axis=1), atol=1e-6)
 
 
-def test_what_a_mask_calls_background_is_not_fitted_to():
+def test_planes_are_not_fitted_to_masked_background():
     camera = look_at((0, 0, -3), size=(40, 30), focal=50.0, up=(0.0, 1.0, 0.0))
     image, alpha = StereoImage.of(camera, np.full((30, 40), 90, np.uint8)), np.zeros((30, 40), np.uint8)
-    alpha[:, :5] = 255  # a narrow thing, as bright as what is behind it
+    alpha[:, :5] = 255  # a narrow object of the same grey as its background
     inverse = np.where(alpha > 0, np.float32(0.5), np.float32(0.3))
     plane = np.stack([inverse, np.zeros_like(inverse), np.zeros_like(inverse)], axis=2)
 

@@ -1,4 +1,4 @@
-"""Edges of photographs: surfaces that are as bright as each other are parted by their colours."""
+"""Edges of photographs: colours separate surfaces of equal brightness."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from linprim_geo.stereo.noise import noise_of
 from linprim_geo.stereo.planes.plain_regions import regions_of_views
 
 SHAPE, BORDER = (97, 121), 60
-# Brown wood and a grey wall, of the same grey within one.
+# Brown wood and a grey wall, whose grey values differ by less than one.
 BROWN, GREY = np.array([100.0, 70, 55]), np.array([77.0, 77, 77])
 
 
 def photograph(right: np.ndarray = GREY, noise: float = 2.0, quality: int = 90) -> np.ndarray:
-    """(H, W, 3) uint8, brown on the left, as JPEG with colours of half the size."""
+    """(H, W, 3) uint8, brown on the left, as JPEG with chroma at half resolution."""
     rgb = np.where((np.arange(SHAPE[1]) < BORDER)[:, None], BROWN, right)[None].repeat(SHAPE[0], 0)
     rgb = rgb + np.random.default_rng(0).normal(0, noise, rgb.shape)
     file = io.BytesIO()
@@ -37,7 +37,7 @@ def seen(rgb: np.ndarray, with_colours: bool) -> DepthMap:
 
 
 @pytest.mark.parametrize("quality", [75, 90])
-def test_surfaces_of_one_grey_are_parted_by_colour(quality):
+def test_colour_separates_surfaces_of_equal_grey(quality):
     rgb = photograph(quality=quality)
     maps = [seen(rgb, with_colours) for with_colours in (False, True)]
     by_grey, by_both = (found.all_edges() for found in maps)
@@ -46,7 +46,7 @@ def test_surfaces_of_one_grey_are_parted_by_colour(quality):
     assert (by_both[:-1, near].sum(1) >= 2).all() and by_both[:, ~near].mean() < 0.05
 
 
-def test_plain_regions_end_at_edges_of_colour():
+def test_plain_regions_end_at_colour_edges():
     rgb = photograph()
     rgb[:2] = rgb[-2:] = 0  # stereo has depths along these edges
     grey_only, both = (seen(rgb, with_colours) for with_colours in (False, True))
@@ -56,12 +56,12 @@ def test_plain_regions_end_at_edges_of_colour():
     assert left.left + left.mask.shape[1] < BORDER + 8 and right.left > BORDER - 8
 
 
-def test_one_colour_has_no_edges():
+def test_uniform_colour_has_no_edges():
     rgb = photograph(right=BROWN)
     assert colour_edges(colours_of(rgb), SHAPE).mean() < 0.05
 
 
-def test_grey_alone_changes_no_colour():
+def test_an_edge_of_grey_is_no_colour_edge():
     rgb = photograph(right=BROWN + 60, noise=0.0, quality=100)
     assert edges_of(rgb[..., 1], 1.0).any() and not colour_edges(colours_of(rgb), SHAPE).any()
 
@@ -76,7 +76,7 @@ def test_colours_are_means_of_two_by_two_pixels(shape):
     assert colour_edges(colours, shape).shape == shape
 
 
-def test_colours_come_back_from_grey_and_their_differences():
+def test_rgb_is_recovered_from_grey_and_colour_differences():
     rgb = np.random.default_rng(0).uniform(0, 255, (7, 9, 3))  # the last row and column have no block
     means = rgb[:6, :8].reshape(3, 2, 4, 2, 3).mean((1, 3))
     np.testing.assert_allclose(rgb_of(means @ edges.GREY, colours_of(rgb)), means, atol=1e-3)

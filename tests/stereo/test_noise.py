@@ -1,4 +1,4 @@
-"""Noise of photographs: what their own pixels tell of it, and what others of the same surface do."""
+"""Noise of photographs, estimated from one photograph and from several of the same surface."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def depth_of(view) -> np.ndarray:
 
 
 def greys(deviation: float, seed: int = 0, finer: float = 1.0) -> list[np.ndarray]:
-    """Photographs of the plane with noise of so many grey values, and waves of 16 to 32 pixels, `finer` by a factor."""
+    """Photographs of the plane with noise of this deviation, and a texture of waves of 16 to 32 pixels / `finer`."""
     rng, scale = np.random.default_rng(seed), finer / 4
     clean = (photograph(view, lambda x, y: texture(scale * x, scale * y)).rgb[..., 0] for view in CAMERAS)
     return [np.rint(np.clip(grey + deviation * rng.normal(size=grey.shape), 0, 255)).astype(np.uint8) for grey in clean]
@@ -27,36 +27,36 @@ def greys(deviation: float, seed: int = 0, finer: float = 1.0) -> list[np.ndarra
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("deviation", [2.0, 4.0, 8.0])
-def test_what_photographs_share_is_no_noise(deviation, seed):
-    """Between the variance and 1.44 times it, as much as bilinear samples of the other one have in the mean; a tenth of
-    a few thousand variances is known within 15 %."""
+def test_shared_noise_agrees_with_the_true_variance(deviation, seed):
+    """The estimate lies between the variance and 1.44 times it, which includes the noise of bilinear samples. Its own
+    statistical error is below 15 %."""
     shots = greys(deviation, seed)
     found = shared_noise(CAMERAS, shots, [depth_of(view) for view in CAMERAS], OTHERS)
     assert (np.array(found) > 0.85 * deviation**2).all()
     assert (np.array(found) < 1.15 * 1.44 * deviation**2).all()
 
 
-def test_noise_has_no_bound_where_nothing_is_shared():
+def test_shared_noise_is_infinite_without_common_surface():
     shots, depths = greys(3.0), [depth_of(view) for view in CAMERAS]
     unknown = [depths[0], np.full_like(depths[1], np.nan), depths[2]]
     assert np.isfinite(shared_noise(CAMERAS, shots, unknown, OTHERS)).tolist() == [True, False, True]
     assert shared_noise(CAMERAS, shots, depths, [[], [], []]) == [np.inf] * 3
-    # What is clipped has no noise, and tells of none.
+    # Clipped pixels have no noise, so they are not used.
     white = [np.full_like(shot, 255) for shot in shots]
     assert shared_noise(CAMERAS, white, depths, OTHERS) == [np.inf] * 3
-    # Where the other photograph shows something nearer.
+    # The other photograph has a nearer depth: the point is occluded.
     before = [depths[0], 0.9 * depths[1], 0.8 * depths[2]]
     assert shared_noise(CAMERAS, shots, before, OTHERS) == [np.inf] * 3
 
 
-def test_photographs_that_differ_by_nothing_have_the_least_noise():
+def test_identical_photographs_have_the_least_noise():
     flat = [np.full((96, 96), 90, np.uint8)] * 3
     assert shared_noise(CAMERAS, flat, [depth_of(view) for view in CAMERAS], OTHERS) == [LEAST_NOISE] * 3
 
 
-def test_texture_all_over_is_no_plain_region():
-    """A photograph with waves of four to eight pixels everywhere passes for plain by its own plainest tenth, and not
-    where others tell its noise."""
+def test_texture_everywhere_has_edges_with_shared_noise():
+    """Waves of four to eight pixels everywhere look like noise in a single photograph, but not in comparison with
+    others."""
     shots = greys(1.0, finer=4.0)
     grey, depths = shots[0], [depth_of(view) for view in CAMERAS]
     most = shared_noise(CAMERAS, shots, depths, OTHERS)[0]
@@ -64,7 +64,7 @@ def test_texture_all_over_is_no_plain_region():
     assert edges_of(grey, noise_of(grey), most).mean() > 0.95
 
 
-def test_noise_is_measured_past_what_the_picture_shows():
+def test_noise_of_a_smooth_picture_is_measured_within_5_percent():
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:200, :300]
     smooth = 60 + 0.3 * x + 0.2 * y + 20 * np.sin(x / 30)

@@ -1,4 +1,4 @@
-"""Points on surfaces by stereo of small photographs: on the walls of a textured room, and where masks allow."""
+"""Points on surfaces by stereo of small photographs: on the walls of a textured room, and inside masks."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from linprim_geo.stereo.surface_points import SurfaceMap, small_copies, surface_
 
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
 SIZE = (96, 72)
-# The middle and the normal of a plate before a corner of the room, and half of its sides.
+# Centre and normal of a plate in front of a corner of the room, and half of its side length.
 PLATE, HALF_PLATE = (np.array([0.5, 0.8, 0.0]), np.array([0.6, 0.8, 0.0])), 0.35
 # A pixel at the corner of the room is 2.6 / 80 there, and the best parallax 0.78: a tenth of a pixel of disparity
 # is 1 % of the depth. Depths are confirmed within CONFIRMED_DEPTH, 1 %.
@@ -54,7 +54,7 @@ def test_points_lie_on_the_walls(views, known):
     assert share_known(maps) > 0.5 and found.xyz.shape == found.rgb.shape == (500, 3)
     assert np.median(off_the_walls(found.xyz)) < TOLERANCE / 3
     assert (off_the_walls(found.xyz) < TOLERANCE).mean() > 0.95
-    # As the photographs show them: the nearest pixel of one of them, in the mean over views.
+    # Colours agree with the nearest pixel of a photograph; they are means over views.
     camera = views[0].camera
     pixels, depth = camera.project(found.xyz)
     inside = (depth > 0) & ((pixels > 1) & (pixels < np.array(SIZE) - 1)).all(1)
@@ -63,7 +63,7 @@ def test_points_lie_on_the_walls(views, known):
     assert np.abs(shown - found.rgb[inside]).mean() < 15
 
 
-def test_fewer_are_given_than_there_are_and_the_same_each_time(views, known):
+def test_points_are_a_reproducible_subset_of_known_depths(views, known):
     maps, same = (surface_maps(small_copies(views), known, 3) for _ in range(2))
     few, again, every = surface_points(maps, 100, 3), surface_points(same, 100, 3), surface_points(maps, 10**6, 3)
     assert len(few.xyz) == 100 and (few.xyz == again.xyz).all()
@@ -72,7 +72,7 @@ def test_fewer_are_given_than_there_are_and_the_same_each_time(views, known):
     assert all(tuple(point) in rows for point in few.xyz)
 
 
-def test_skies_are_looked_for_where_that_is_asked(views, known, monkeypatch):
+def test_skies_are_detected_only_on_request(views, known, monkeypatch):
     seen = [number % 2 == 0 for number in range(len(views))]
     monkeypatch.setattr(module, "shows_sky", lambda maps: seen)
     assert [found.shows_sky for found in surface_maps(small_copies(views), known, 0, skies=True)] == seen
@@ -90,7 +90,7 @@ def test_masked_pixels_give_no_points(views, known, tmp_path):
     maps = surface_maps(small_copies(kept), known, 0)
     found = surface_points(maps, 10**6, 0)
     assert 0 < share_known(maps) <= 0.5 and len(found.xyz)
-    # What is masked in every view lies below all their middle rows.
+    # Every point lies in the unmasked upper half of at least one view.
     shown = np.zeros(len(found.xyz), bool)
     for view in views:
         pixels, depth = view.camera.project(found.xyz)
@@ -116,27 +116,27 @@ def on_the_plate(points: np.ndarray, margin: float) -> np.ndarray:
     return inside & (np.abs(off) < 0.03)
 
 
-def test_what_nothing_around_continues_gives_no_points(known, tmp_path, monkeypatch):
-    """Beyond the edges of what stands before a wall windows hold both: stereo takes the wall there for nearer."""
+def test_depths_without_support_give_no_points(known, tmp_path, monkeypatch):
+    """Beside edges of the plate windows contain plate and wall, and stereo gives depths in front of the wall."""
     kept = []
     for number, center in enumerate(CENTERS):
         camera, path = look_at(center, target=(1.6, 2.0, 0.1), size=SIZE, focal=80.0), tmp_path / f"{number}.png"
         Image.fromarray(with_a_plate(camera)).save(path)
         kept.append(View(path.name, camera, path))
 
-    def in_the_air() -> tuple[float, int]:
+    def share_in_the_air() -> tuple[float, int]:
         xyz = surface_points(surface_maps(small_copies(kept), known, 0), 10**6, 0).xyz
         air = (off_the_walls(xyz) > TOLERANCE) & ~on_the_plate(xyz, 0.0)
         return air.mean(), int(on_the_plate(xyz, 0.0).sum())
 
-    share, on_plate = in_the_air()
+    share, on_plate = share_in_the_air()
     monkeypatch.setattr(module, "LEAST_SUPPORT", 0.0)
     monkeypatch.setattr(DepthMap, "is_confirmed", lambda self, *_: self.confirming >= CONFIRMING)
-    share_of_all, on_plate_of_all = in_the_air()
+    share_of_all, on_plate_of_all = share_in_the_air()
     assert share_of_all > 0.001 and share < 0.3 * share_of_all and on_plate > 0.6 * on_plate_of_all > 1000
 
 
-def test_small_copies_are_means_of_the_photographs_and_few(views, monkeypatch):
+def test_small_copies_average_pixels_and_are_limited_in_number(views, monkeypatch):
     monkeypatch.setattr(module, "LONGER_SIDE", 40)
     monkeypatch.setattr(module, "MOST_VIEWS", 3)
     small = small_copies(views)

@@ -1,4 +1,4 @@
-"""Vignetting by points that several photographs show: its law comes back, and nothing is found where there is none."""
+"""Vignetting by points that several photographs show: it is recovered, and none is found where there is none."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def wall(seed: int, law, shine: float = 0.0):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("law", [(-0.1, 0.0), (-0.02, -0.05), (-0.3, 0.05)])
-def test_the_law_comes_back(seed, law):
+def test_the_falloff_is_recovered_within_half_a_percent(seed, law):
     cameras, greys, depths = wall(seed, law)
     found = vignetting(cameras, greys, depths)
-    # Noise of 2 in greys of 120, averaged over 9 pixels, at hundreds of points of each of 25 pairs: below 0.1 %; means
-    # of pixels over a texture that is as fine as 3 of them are off by more, 0.25 % for these seeds.
+    # Noise of 2 in grey values of 120 contributes below 0.1 % (9 pixels, hundreds of points, 25 pairs). Averaging
+    # pixels of a fine texture contributes more, 0.25 % for these seeds.
     off = falloff(cameras[0], found) / falloff(cameras[0], np.asarray(law))
     assert np.ptp(off) < 0.005
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_highlight_that_moves_is_not_taken_for_much(seed):
+def test_a_moving_highlight_adds_less_than_1_percent(seed):
     cameras, greys, depths = wall(seed, (0.0, 0.0), shine=0.3)
     assert np.ptp(falloff(cameras[0], vignetting(cameras, greys, depths))) < 0.01
 
 
-def test_without_vignetting_or_without_points_there_is_none():
+def test_no_vignetting_is_found_without_falloff_or_points():
     cameras, greys, depths = wall(0, (0.0, 0.0))
     assert np.ptp(falloff(cameras[0], vignetting(cameras, greys, depths))) < 0.005
     nothing = [np.full_like(depth, np.nan) for depth in depths]
@@ -60,7 +60,7 @@ def test_without_vignetting_or_without_points_there_is_none():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_points_in_the_middle_alone_make_no_law_for_corners(seed):
+def test_central_points_alone_give_little_falloff_at_corners(seed):
     cameras, greys, depths = wall(seed, (0.0, 0.0))
     square = falloff(cameras[0], np.array([1.0, 0.0]))
     middle = [np.where(np.log(square) < 0.05, depth, np.nan) for depth in depths]

@@ -1,5 +1,5 @@
-"""The command stereo on photographs of a textured room: files that COLMAP reads, confidence that holds, the same bits
-after a stop and for any number of threads."""
+"""The command `stereo` on photographs of a textured room: files that COLMAP reads, calibrated confidence, and the same
+bits after an interruption and with any number of threads."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from linprim_geo.stereo.depth_maps import depth_maps
 
 SIZE = (96, 72)
 CENTERS = [(x, y, 0.0) for y in (-0.35, 0.0) for x in (-0.7, -0.35, 0.0)]
-# Calibration errors of captures that the law was not fitted to are up to 0.16 (docs/stereo.md).
+# Calibration errors on captures that the confidence was not fitted to are up to 0.16 (docs/stereo.md).
 CALIBRATION = 0.16
 
 
 def cameras() -> list:
-    """In the room, towards a corner of two walls."""
+    """Cameras in the room that look at a corner of two walls."""
     return [look_at(center, target=(1.6, 2.0, 0.1), size=SIZE, focal=80.0) for center in CENTERS]
 
 
@@ -57,17 +57,17 @@ def capture(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(capture, tmp_path_factory) -> dense.Dense:
-    """What the command makes of it."""
+    """The result of the command for this capture."""
     return dense.run_stereo(capture, tmp_path_factory.mktemp("made") / "dense", None, None, None, quiet=True)
 
 
 def contents(root: Path) -> dict[str, bytes]:
-    """Files by their names, but for stereo.json, which holds seconds."""
+    """Files by their names, without stereo.json, which contains durations."""
     files = [path for path in root.rglob("*") if path.is_file() and path.name != dense.NOTES]
     return {str(path.relative_to(root)): path.read_bytes() for path in files}
 
 
-def test_maps_are_those_of_stereo_in_memory(capture, made):
+def test_maps_on_disk_equal_those_in_memory(capture, made):
     views = made.workspace.views
     points = pycolmap.Reconstruction(str(capture / "sparse" / "0")).points3D.values()
     expected = depth_maps(views, np.array([point.xyz for point in points]))
@@ -75,7 +75,7 @@ def test_maps_are_those_of_stereo_in_memory(capture, made):
         assert np.array_equal(made.workspace.read_maps(k).depth, np.nan_to_num(each.depth))
 
 
-def test_confidence_is_the_share_of_depths_that_are_right(made):
+def test_mean_confidence_agrees_with_the_share_of_right_depths(made):
     predicted, right = [], []
     for k, view in enumerate(made.workspace.views):
         maps = made.workspace.read_maps(k)
@@ -84,14 +84,14 @@ def test_confidence_is_the_share_of_depths_that_are_right(made):
         predicted.append(maps.confidence[known])
         right.append((np.abs(maps.depth / true_depth(view.camera) - 1) < RIGHT)[known])
     confidence, is_right = np.concatenate(predicted), np.concatenate(right)
-    # Pixels of one window of 11 by 11 are right or wrong together: as many independent ones as there are windows.
+    # Errors are correlated within windows of 11x11 pixels: count one independent sample per window.
     error = 3 * np.sqrt(0.25 * 11**2 / len(is_right))
     assert abs(confidence.mean() - is_right.mean()) < CALIBRATION + error
     sure = confidence > np.median(confidence)
     assert is_right[sure].mean() > is_right[~sure].mean()
 
 
-def test_normals_are_in_the_camera_and_towards_it(made):
+def test_normals_are_in_camera_axes_and_face_the_camera(made):
     camera = made.workspace.views[0].camera
     maps = made.workspace.read_maps(0)
     sure = maps.confidence > 0.9
@@ -107,7 +107,7 @@ def test_colmap_reads_and_fuses_the_folder(made, tmp_path):
     assert model.num_reg_images() == len(CENTERS) and model.num_points3D() > 100
     assert model.compute_mean_track_length() >= 3
     model.update_point_3d_errors()
-    # Observations are middles of pixels.
+    # Observations are at centres of pixels.
     assert np.median([point.error for point in model.points3D.values()]) < 1
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels, options.num_threads = 3, 1
@@ -124,7 +124,7 @@ def test_colmap_reads_and_fuses_the_folder(made, tmp_path):
     )
 
 
-def test_points_are_on_the_walls_once_and_face_the_cameras(made):
+def test_points_lie_on_the_walls_without_duplicates(made):
     from linprim_geo.capture.readers.ply_points import read_points_ply
 
     path = made.workspace.root / dense.POINTS
@@ -140,7 +140,7 @@ def test_points_are_on_the_walls_once_and_face_the_cameras(made):
     assert properties == b"x y z nx ny nz red green blue confidence".split()
 
 
-def test_a_stopped_run_goes_on_to_the_same_files(capture, made, tmp_path, monkeypatch):
+def test_a_resumed_run_writes_the_same_files(capture, made, tmp_path, monkeypatch):
     calls = []
 
     def interrupted(*arguments):
@@ -159,11 +159,11 @@ def test_a_stopped_run_goes_on_to_the_same_files(capture, made, tmp_path, monkey
         dense.run_stereo(capture, target, None, None, None, quiet=True)
     (target / "images" / ".0.abc.tmp.png").write_bytes(b"what a kill has left")
     dense.run_stereo(capture, target, None, None, None, resume=True, quiet=True)
-    assert len(calls) == 4 + len(CENTERS) - 3  # three were done
+    assert len(calls) == 4 + len(CENTERS) - 3  # three maps were complete
     assert contents(target) == contents(made.workspace.root)
 
 
-def test_a_finished_run_only_fuses_again(made, tmp_path, capture, monkeypatch):
+def test_resuming_a_finished_run_only_fuses_again(made, tmp_path, capture, monkeypatch):
     target = tmp_path / "dense"
     shutil.copytree(made.workspace.root, target)
     monkeypatch.setattr(dense, "PlanesOnDisk", None)
@@ -178,17 +178,17 @@ def test_files_do_not_depend_on_the_number_of_threads(capture, made, tmp_path, f
     assert contents(target) == contents(made.workspace.root)
 
 
-def test_a_downscaled_capture_has_photographs_of_its_own(capture, tmp_path):
+def test_downscale_applies_to_photographs_and_maps(capture, tmp_path):
     small = dense.run_stereo(capture, tmp_path / "dense", SceneOptions(downscale=2), None, None, quiet=True)
     assert small.workspace.colors(0).shape == (SIZE[1] // 2, SIZE[0] // 2, 3)
     assert small.workspace.read_maps(0).depth.shape == (SIZE[1] // 2, SIZE[0] // 2)
 
 
-def test_a_budget_takes_smaller_photographs_then_fewer(made):
+def test_a_budget_reduces_size_before_number_of_photographs(made):
     views = [view for view in made.workspace.views for _ in range(20)]
     large = [type(view)(**{**vars(view), "camera": view.camera.magnified(10)}) for view in views]
     pixels = sum(view.camera.width * view.camera.height for view in large)
-    # 960 pixels along the longer side: averaged down to 240 at the least.
+    # 960 pixels along the longer side are averaged down to no less than 240.
     for seconds, wanted in ((2000, (1, 120)), (700, (2, 120)), (120, (3, 120)), (30, (4, 55))):
         plan = planned(large, 1000 / pixels, Budget(seconds))
         assert (plan.downscale, plan.views) == wanted
@@ -206,7 +206,7 @@ def test_the_command_prints_one_line_and_writes_a_page(capture, tmp_path, capsys
     assert page.count("<figure>") == len(CENTERS) and "linprim-geo stereo" in page
 
 
-def test_what_cannot_be_used_is_one_sentence(capture, made, tmp_path):
+def test_unusable_captures_are_refused(capture, made, tmp_path):
     def refused(match, scene=capture, output=None, **options):
         with pytest.raises(LinprimError, match=match):
             dense.run_stereo(scene, output or tmp_path / "dense", SceneOptions(**options), None, None, quiet=True)
@@ -224,7 +224,7 @@ def test_what_cannot_be_used_is_one_sentence(capture, made, tmp_path):
     refused("2 photographs with poses, wanted at least 3", scene=two)
 
 
-def test_photographs_through_a_lens_are_written_as_a_pinhole_sees_them(tmp_path):
+def test_photographs_are_undistorted_before_writing(tmp_path):
     from linprim_geo.synthetic.synth import synthesize
 
     settings = {"views": 8, "test_views": 0, "size": 64, "points": 500, "supersample": 1, "distortion": -0.1}
@@ -234,12 +234,12 @@ def test_photographs_through_a_lens_are_written_as_a_pinhole_sees_them(tmp_path)
     for k, view in enumerate(found.workspace.views):
         assert view.lens is not None and found.workspace.image(k).suffix == ".png"
         assert np.array_equal(found.workspace.colors(k), view.load().rgb)
-    # The middle of the first pixel is 0.5, as in COLMAP.
+    # The centre of the first pixel is at 0.5, as in COLMAP.
     camera, taken = found.workspace.views[0].camera, model.camera(1)
     assert taken.model_name == "PINHOLE" and np.allclose(taken.params, [camera.fx, camera.fy, camera.cx, camera.cy])
 
 
-def test_notes_that_are_damaged_are_one_sentence(capture, made, tmp_path):
+def test_damaged_notes_are_refused(capture, made, tmp_path):
     for text in ("[", "[]", "{}", '{"names": [], "downscale": null, "scene": ""}'):
         target = tmp_path / "dense"
         target.mkdir(exist_ok=True)
@@ -248,7 +248,7 @@ def test_notes_that_are_damaged_are_one_sentence(capture, made, tmp_path):
             dense.run_stereo(capture, target, None, None, None, resume=True, quiet=True)
 
 
-def test_photographs_that_do_not_fit_into_memory_are_one_sentence(capture, tmp_path, monkeypatch):
+def test_photographs_that_exceed_memory_are_refused(capture, tmp_path, monkeypatch):
     monkeypatch.setattr("linprim_geo.stereo.dense.planes_on_disk.available_memory", lambda: 2**20)
     with pytest.raises(LinprimError, match="photographs of 96x72 takes 0.0 GiB of the 0.0 that are free"):
         dense.run_stereo(capture, tmp_path / "dense", None, None, None, quiet=True)

@@ -1,4 +1,4 @@
-"""Poses of a capture that err are adjusted, exact ones stay; runs keep what was found."""
+"""Given poses: wrong ones are adjusted, exact ones are kept, and runs keep a copy."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ SIZE, FOCAL, COUNT, ERROR_PX = (240, 180), 200.0, 14, 1.0
 
 
 def true_cameras(turned: int = COUNT) -> list[Camera]:
-    """From the one numbered `turned` on each looks more to the left than the one before it."""
+    """From number `turned` on each camera looks farther to the left than the one before it."""
     places = [(-0.9 + 0.12 * i, -1.0 + 0.1 * (i % 4), 0.3 * np.sin(2.0 * i)) for i in range(COUNT)]
     aims = [(1.5 - 0.3 * max(0, i + 1 - turned), 2.0, 0.2) for i in range(COUNT)]
     return [look_at(place, aim, SIZE, FOCAL) for place, aim in zip(places, aims, strict=True)]
 
 
 def shaken(camera: Camera, rng: np.random.Generator) -> Camera:
-    """Half of the square of ERROR_PX by turning, half by moving, at a depth of 3.5."""
+    """Perturb a pose so that half of the variance ERROR_PX^2 is due to rotation, half to translation, at depth 3.5."""
     deviation = ERROR_PX / 2 / FOCAL
     pose = camera.world_to_camera.copy()
     pose[:3] = Rotation.from_rotvec(rng.normal(0, deviation, 3)).as_matrix() @ pose[:3]
@@ -68,7 +68,7 @@ def rooms(tmp_path_factory):
 
 
 def off_px(scene) -> float:
-    """By how far views see points of the walls from where true cameras do, root mean square."""
+    """RMS distance in pixels between points of the walls as seen by the views and by the true cameras."""
     walls = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [0.6, 0.6, 0.4] + [1.4, 1.9, 0.2]
     true, off = true_cameras(), []
     for view in scene.views:
@@ -77,12 +77,12 @@ def off_px(scene) -> float:
 
 
 def bent_px(scene) -> float:
-    """The same after the best similarity of the world, which nothing in photographs tells."""
+    """The same after the best similarity transform, which photographs do not determine."""
     return float(np.sqrt(np.mean(bent_of_each(scene.views, true_cameras()) ** 2)))
 
 
 def bent_of_each(views, true: list[Camera]) -> np.ndarray:
-    """(V,) that of each view."""
+    """(V,) the same for each view."""
     walls = np.random.default_rng(0).uniform(-1, 1, (300, 3)) * [0.6, 0.6, 0.4] + [1.4, 1.9, 0.2]
     wanted = np.concatenate([true[int(view.name)].project(walls)[0] for view in views])
 
@@ -93,8 +93,8 @@ def bent_of_each(views, true: list[Camera]) -> np.ndarray:
     return np.sqrt(2 * np.square(least_squares(off, np.zeros(7)).fun).reshape(len(views), -1).mean(1))
 
 
-def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
-    """Left are 0.0035 pixels of 0.78, and 0.0092 by keypoints alone, which photographs without patches keep."""
+def test_patches_give_more_accurate_poses_than_keypoints(rooms, tmp_path, monkeypatch):
+    """Measured: 0.78 pixels before, 0.0035 with patches, 0.0092 with keypoints alone."""
     given, lines, counts = load_scene(rooms["wrong"]), [], []
     adjust = module.bundle_adjusted
 
@@ -119,25 +119,25 @@ def test_patches_are_more_exact_than_keypoints(rooms, tmp_path, monkeypatch):
         assert (one.camera.world_to_camera == other.camera.world_to_camera).all()
 
 
-def test_keypoints_judge_patches(rooms, tmp_path, monkeypatch):
-    """Patches of one photograph in two move with it, as highlights would."""
+def test_patches_that_contradict_keypoints_are_refused(rooms, tmp_path, monkeypatch):
+    """Patches are shifted by one offset per photograph in every other photograph, as highlights would be."""
 
-    def gliding(*given):
+    def shifted_tracks(*given):
         tracks = patch_tracks(*given)
         off = np.random.default_rng(1).normal(0, 3, (COUNT, 2))[tracks.image]
         return replace(tracks, pixel=tracks.pixel + off * (tracks.image % 2)[:, None])
 
     given, lines = load_scene(rooms["wrong"]), []
-    monkeypatch.setattr(module, "patch_tracks", gliding)
+    monkeypatch.setattr(module, "patch_tracks", shifted_tracks)
     found = adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append)
     assert any("contradict patches" in line for line in lines)
     assert bent_px(found) < 0.02
 
 
 @pytest.mark.parametrize("plain", [(), (COUNT - 1,)])
-def test_photographs_without_keypoints_join_by_what_stereo_finds_in_others(plain, tmp_path, monkeypatch):
-    """Four photographs turn away from all that has keypoints; of up to 1.3 pixels 0.008 at most are left of any. One
-    that is grey all over never joins, and keeps no others from it."""
+def test_photographs_without_keypoints_are_adjusted_by_patches(plain, tmp_path, monkeypatch):
+    """Four photographs show nothing that has keypoints. Errors of up to 1.3 pixels fall to 0.008 at most. A uniformly
+    grey photograph never joins, and does not keep the others from joining."""
     true, turned, rng = true_cameras(COUNT - 4), np.arange(COUNT - 4, COUNT), np.random.default_rng(2)
     pictures = [
         np.full((SIZE[1], SIZE[0], 3), 90, np.uint8) if k in plain else photograph(c) for k, c in enumerate(true)
@@ -164,13 +164,13 @@ def test_photographs_without_keypoints_join_by_what_stereo_finds_in_others(plain
     assert bent_of_each(after, true).max() < 0.03 < 0.1 < bent_of_each(before, true).min()
 
 
-def test_wrong_poses_are_adjusted_and_kept(rooms, tmp_path, monkeypatch):
+def test_wrong_poses_are_adjusted_and_cached(rooms, tmp_path, monkeypatch):
     given, lines = load_scene(rooms["wrong"]), []
     found = adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append)
     assert found.adjusted is not None and found.adjusted.error_px == pytest.approx(ERROR_PX, rel=0.4)
     assert off_px(found) < 0.5 * off_px(given)
     assert len(lines) == 2 and "keypoints contradict" in lines[0] and "--poses given" in lines[1]
-    monkeypatch.setattr(module, "triangulate_features", None)  # what is kept is not found again
+    monkeypatch.setattr(module, "triangulate_features", None)  # cached poses are not computed again
     again = adjusted_scene(given, cache=tmp_path, log=lines.append)
     assert len(lines) == 3
     for one, other in zip(found.views, again.views, strict=True):
@@ -178,7 +178,7 @@ def test_wrong_poses_are_adjusted_and_kept(rooms, tmp_path, monkeypatch):
         assert one.camera.fx == other.camera.fx == found.adjusted.focal_factor * FOCAL
 
 
-def test_exact_poses_stay_to_the_bit(rooms, tmp_path, monkeypatch):
+def test_exact_poses_are_not_changed(rooms, tmp_path, monkeypatch):
     given, lines = load_scene(rooms["exact"]), []
     assert adjusted_scene(given, cache=tmp_path, threads=1, log=lines.append) is given
     assert len(lines) == 1 and "do not contradict" in lines[0]
@@ -186,7 +186,7 @@ def test_exact_poses_stay_to_the_bit(rooms, tmp_path, monkeypatch):
     assert adjusted_scene(given, cache=tmp_path, log=lines.append) is given
 
 
-def test_poses_that_we_found_and_small_photographs_are_not_looked_at(rooms, tmp_path, monkeypatch):
+def test_found_poses_and_small_photographs_are_not_adjusted(rooms, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "triangulate_features", None)
     given = replace(load_scene(rooms["wrong"]), kind=PHOTOGRAPHS)
     assert adjusted_scene(given, cache=tmp_path, log=print) is given
@@ -194,7 +194,7 @@ def test_poses_that_we_found_and_small_photographs_are_not_looked_at(rooms, tmp_
     assert adjusted_scene(small, cache=tmp_path, log=print) is small
 
 
-def test_of_many_photographs_some_say_whether_poses_err(rooms, tmp_path, monkeypatch):
+def test_a_sample_of_photographs_decides_about_adjustment(rooms, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ASKED_VIEWS", 7)
     monkeypatch.setattr(module, "LEAST_POINTS", 60)
     found = adjusted_scene(load_scene(rooms["wrong"]), cache=tmp_path, threads=1, log=lambda line: None)
@@ -205,7 +205,7 @@ def test_of_many_photographs_some_say_whether_poses_err(rooms, tmp_path, monkeyp
     assert str(COUNT - 1) in lines[0]
 
 
-def test_a_run_keeps_its_poses(rooms, tmp_path, monkeypatch):
+def test_a_run_keeps_its_adjusted_poses(rooms, tmp_path, monkeypatch):
     monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
     options = TrainOptions(iterations=2, max_primitives=200, evaluate_every=0, start="points")
     train(rooms["wrong"], tmp_path / "run", options=options, quiet=True)
@@ -217,9 +217,8 @@ def test_a_run_keeps_its_poses(rooms, tmp_path, monkeypatch):
     assert off_px(Run.open(tmp_path / "as_given").scene()) == off_px(load_scene(rooms["wrong"]))
 
 
-def test_photographs_of_a_lens_with_distortion_stay_as_they_are(rooms, tmp_path):
-    """A focal length that is longer by 2 % is one of the lens, too: undistorted for it alone, photographs would be
-    enlarged, and show what they showed under the focal length before."""
+def test_adjusted_focal_lengths_apply_to_the_lens_too(rooms, tmp_path):
+    """If only the pinhole camera were scaled by 2 %, undistortion would enlarge the photographs by the same factor."""
     saved = json.loads((rooms["exact"] / "transforms.json").read_text())
     root = Path(shutil.copytree(rooms["exact"], tmp_path / "lens"))
     (root / "transforms.json").write_text(json.dumps(saved | {"k1": 0.05}))
@@ -250,7 +249,7 @@ def test_photographs_of_a_lens_with_distortion_stay_as_they_are(rooms, tmp_path)
         {"poses": {"00": (2 * np.eye(4)).tolist()}},
     ],
 )
-def test_damaged_files_are_refused_in_one_sentence(tmp_path, damage):
+def test_damaged_pose_files_are_refused(tmp_path, damage):
     path = tmp_path / ADJUSTED_POSES
     whole = AdjustedPoses({"00": np.eye(4)}, 1.001, 0.5)
     whole.write(path)

@@ -1,4 +1,4 @@
-"""What training fills a sky with beside a house, where other photographs show the sky."""
+"""Parts of the sky that training fills with primitives, where other photographs show background."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def photograph(camera, grey) -> DepthMap:
 
 
 def scene(fog: int = FOG, cloud: bool = False):
-    """(maps, backgrounds, known, rendered): all is known of the house and nothing of the sky, which the others see down
-    to the roof."""
+    """(maps, backgrounds, known, rendered). Depths of the house are known, those of the sky are not. The other views
+    have background down to the roof; the first has rendered fog above it."""
     grey = np.where(SKY, 200, 60)
     if cloud:
         grey[5:15, 20:50] = 240
@@ -36,21 +36,21 @@ def scene(fog: int = FOG, cloud: bool = False):
 
 
 @pytest.mark.parametrize("cloud", [False, True])
-def test_a_sky_is_far_down_to_the_outline_of_a_house(cloud):
+def test_sky_is_far_down_to_the_outline_of_the_house(cloud):
     maps, backgrounds, known, rendered = scene(cloud=cloud)
     for far, background in zip(far_parts(maps, backgrounds, known, rendered, NONE), backgrounds, strict=True):
         assert (far | background)[: ROOF - 1].all() and not far[ROOF + 1 :].any()
 
 
-def test_one_other_photograph_is_enough():
+def test_one_other_photograph_with_background_is_enough():
     maps, backgrounds, known, rendered = scene()
     for other, whole in ((1, True), (2, False)):
         backgrounds[other] = NONE[0]
         assert far_parts(maps, backgrounds, known, rendered, NONE)[0][: ROOF - 1].all() == whole
 
 
-def test_what_others_show_as_something_else_stays():
-    """The side of a table that an environment explains: in its direction others see what is brighter, or known."""
+def test_parts_that_differ_or_are_known_in_other_views_stay():
+    """In the same direction the other views show a brighter background, or have known depths."""
     maps, backgrounds, known, rendered = scene()
     maps[1:] = [photograph(found.camera, np.where(SKY, 230, 60)) for found in maps[1:]]
     assert not far_parts(maps, backgrounds, known, rendered, NONE)[0].any()
@@ -60,14 +60,14 @@ def test_what_others_show_as_something_else_stays():
 
 
 @pytest.mark.parametrize(("fog", "known_rows"), [(20, 0), (FOG, 6)], ids=["mostly-rendered", "partly-known"])
-def test_a_part_stays_that_is_not_mostly_an_unknown_background(fog, known_rows):
+def test_parts_that_are_mostly_rendered_or_partly_known_stay(fog, known_rows):
     maps, backgrounds, known, rendered = scene(fog)
     known[0][(ROWS >= ROOF - known_rows) & SKY] = DEPTH
     assert not far_parts(maps, backgrounds, known, rendered, NONE)[0].any()
 
 
-def test_a_surface_stays_that_other_views_know():
-    """A white wall below the sky, without an edge between them: stereo knows it in the others."""
+def test_a_surface_known_in_other_views_stays():
+    """There is no edge between a white wall and the sky above it. Other views have known depths on the wall."""
     maps, backgrounds, known, rendered = scene()
     wall = SKY & (ROWS >= ROOF - 5) & (np.arange(80) < 50)
     for view in (1, 2):
@@ -77,7 +77,7 @@ def test_a_surface_stays_that_other_views_know():
     assert not far[ROOF - 5 : ROOF - 1, 6:44].any() and far[: ROOF - 6].all() and far[: ROOF - 1, 56:].all()
 
 
-def test_what_is_far_by_its_shading_stays_so():
+def test_pixels_far_by_shading_stay_far():
     maps, backgrounds, known, rendered = scene(fog=20)
     told = (ROWS < 20) & (np.arange(80) < 40)
     far = far_parts(maps, backgrounds, known, rendered, [told, *NONE[1:]])[0]
@@ -89,8 +89,8 @@ def test_nothing_is_far_without_a_background():
     assert not np.any(far_parts(maps, NONE, known, rendered, NONE))
 
 
-def test_large_parts_are_judged_by_pixels_all_over_them():
-    """A sky of 2,800 pixels, of which others show the left 30 of 80 columns, or 50."""
+def test_large_parts_are_judged_by_samples_from_the_whole_part():
+    """The other views show 30 or 50 of the 80 columns of a sky of 2,800 pixels as background."""
     assert ROOF * 80 > 20 * LOOKED_AT
     for columns, whole in ((30, False), (50, True)):
         maps, backgrounds, known, rendered = scene()

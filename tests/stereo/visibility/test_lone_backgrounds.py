@@ -1,4 +1,4 @@
-"""Background that one view alone looks at ends at the surface that others know there."""
+"""Background of a single view is replaced where other views know a surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scene():
     return none, [np.full((64, 96), 3.0, np.float32) for _ in CAMERAS]
 
 
-def test_what_one_view_alone_takes_for_background_is_found():
+def test_background_of_a_single_view_is_found():
     backgrounds, known = scene()
     backgrounds[0][HOLE] = True
     first, *others = lone_backgrounds(CAMERAS, backgrounds, known)
@@ -29,23 +29,23 @@ def test_what_one_view_alone_takes_for_background_is_found():
     assert not np.stack(others).any()
 
 
-def test_a_direction_that_two_views_look_past_stays_background():
+def test_background_of_two_views_stays_background():
     backgrounds, known = scene()
     backgrounds[0][HOLE] = backgrounds[1][HOLE] = True
     assert not np.stack(lone_backgrounds(CAMERAS, backgrounds, known)).any()
 
 
-def test_a_hole_that_goes_on_as_a_shared_background_stays():
+def test_a_hole_connected_to_shared_background_stays():
     for common in (True, False):
         backgrounds, known = scene()
         backgrounds[0][HOLE] = True
-        if common:  # a sky above, of all views, which the hole of the first one touches
+        if common:  # all views have sky above the hole, connected to it
             for background in backgrounds:
                 background[:24] = True
         assert lone_backgrounds(CAMERAS, backgrounds, known)[0].any() != common
 
 
-def test_a_surface_that_few_views_know_is_not_taken():
+def test_enough_views_must_know_the_surface():
     for knowing in (AGREEING - 1, AGREEING):
         backgrounds, known = scene()
         backgrounds[0][HOLE] = True
@@ -54,7 +54,7 @@ def test_a_surface_that_few_views_know_is_not_taken():
         assert lone_backgrounds(CAMERAS, backgrounds, known)[0].any() == (knowing == AGREEING)
 
 
-def test_what_others_know_elsewhere_or_the_view_itself_does_not_know_is_left():
+def test_disagreeing_or_unknown_depths_leave_the_background():
     backgrounds, known = scene()
     backgrounds[0][HOLE] = True
     nearer = [known[0], *(0.9 * depth for depth in known[1:])]
@@ -63,7 +63,7 @@ def test_what_others_know_elsewhere_or_the_view_itself_does_not_know_is_left():
     assert not np.stack(lone_backgrounds(CAMERAS, backgrounds, known)).any()
 
 
-def test_a_single_view_has_none():
+def test_one_view_alone_finds_nothing():
     backgrounds, known = scene()
     backgrounds[0][HOLE] = True
     assert not lone_backgrounds(CAMERAS[:1], backgrounds[:1], known[:1])[0].any()

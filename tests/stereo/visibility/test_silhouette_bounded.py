@@ -1,5 +1,5 @@
-"""Things that are known by their outlines: a plain ball before a far wall is, what is rendered before a plain wall is
-not."""
+"""Objects found by their outlines: a textureless ball in front of a far background is found, a rendered ball that the
+photographs do not show is not."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from linprim_geo.stereo.visibility import silhouette_bounded as module
 from linprim_geo.stereo.visibility.silhouette_bounded import between_silhouettes, silhouette_bounded
 from linprim_geo.stereo.visibility.thin_things import RenderedView
 
-# A ball of radius 1 round the origin, seen from 5 away, and a sphere of radius 30 round all.
+# A ball of radius 1 at the origin, seen from a distance of 5, inside of a sphere of radius 30.
 RADIUS, AWAY, FAR = 1.0, 5.0, 30.0
 NOISE = 2.0
 PLAIN, BRIGHT = (40.0, 36.0, 30.0), 150.0
@@ -37,8 +37,8 @@ def sphere_depth(camera: Camera, radius: float, near: bool) -> np.ndarray:
 
 
 def view_of(camera: Camera, seed: int, *, painted: bool = True, ball=PLAIN, stripes: float = 0.0) -> RenderedView:
-    """The ball is rendered, `painted` says whether the photograph has it, too; `stripes` are grey values by which it
-    has a texture."""
+    """Return a view that renders the ball. The photograph has it if `painted`, with a texture of amplitude
+    `stripes`."""
     near, behind = sphere_depth(camera, RADIUS, True), sphere_depth(camera, FAR, False)
     on_ball = np.isfinite(near)
     colors = np.full((*near.shape, 3), BRIGHT)
@@ -57,55 +57,55 @@ def views(count: int = 12, turn: float = 360.0, **options) -> list[RenderedView]
 
 
 def share_found(seen: list[RenderedView]) -> tuple[float, float]:
-    """Of the ball, and of the sphere behind it."""
+    """Share of found pixels on the ball, and on the sphere behind it."""
     ball = np.stack([np.isfinite(sphere_depth(view.camera, RADIUS, True)) for view in seen])
     found = np.stack(silhouette_bounded(seen))
     return found[ball].mean(), found[~ball].mean()
 
 
-def test_a_plain_ball_before_something_else_is_known_by_its_outlines():
+def test_a_textureless_ball_is_found_by_its_outlines():
     found, wrong = share_found(views())
     assert found > 0.85 and wrong == 0
 
 
-def test_what_photographs_do_not_show_is_not_known():
-    """Every view renders the ball, but photographs are those of a plain wall alone: no edge, by chance or otherwise."""
+def test_a_rendered_ball_absent_from_photographs_is_not_found():
+    """Every view renders the ball, but the photographs show a plain wall without edges."""
     assert share_found(views(painted=False)) == (0, 0)
 
 
-def test_a_ball_with_a_texture_as_strong_as_its_outline_is_left_to_stereo():
+def test_a_textured_ball_is_left_to_stereo():
     textured = views(ball=(100.0, 100.0, 100.0), stripes=40.0)
     assert share_found(textured)[0] < 0.05
-    # It is the texture: without it the outline is as strong.
+    # Without the texture the same ball is found.
     assert share_found(views(ball=(100.0, 100.0, 100.0)))[0] > 0.85
 
 
 @pytest.mark.parametrize(("turn", "known"), [(80.0, False), (130.0, True)])
-def test_views_at_right_angles_are_wanted(turn, known):
-    """Outlines that are all seen from one side leave it open how deep the thing lies."""
+def test_views_from_a_wide_range_of_directions_are_required(turn, known):
+    """Outlines that are seen from one side only do not determine the depth."""
     found, _ = share_found(views(turn=turn))
     assert found == 0 if not known else found > 0.2
 
 
-def test_three_views_are_wanted():
+def test_two_views_are_not_enough():
     assert share_found(views(2, 180.0))[0] == 0
 
 
-def test_what_most_views_see_without_outlines_is_not_known():
+def test_outlines_missing_in_most_views_find_nothing():
     """Seven of twelve photographs show no edge where the ball ends."""
     seen, plain = views(), views(painted=False)
     assert share_found([plain[k] if k % 2 == 0 or k == 1 else seen[k] for k in range(12)])[0] < 0.05
 
 
-def test_blurred_depths_are_not_known():
+def test_blurred_depths_are_not_used():
     seen = [replace(view, sharp=np.zeros_like(view.sharp)) for view in views()]
     assert share_found(seen) == (0, 0)
 
 
-def test_a_run_has_an_outline_at_both_ends():
+def test_runs_of_pixels_need_an_outline_at_both_ends():
     depth = np.full((8, 40), 9.0, np.float32)
-    depth[:, 10:25] = 3.0  # ends at something farther on both sides
-    depth[:, 32:] = 3.0  # goes on beyond the border of the photograph
+    depth[:, 10:25] = 3.0  # farther depths on both sides
+    depth[:, 32:] = 3.0  # reaches the border of the photograph
     depth[:, 38:] = 2.0
     rgb = np.where(depth[..., None] < 5, 40, 160).repeat(3, -1).astype(np.uint8)
     camera = Camera(40, 8, 30.0, 30.0, 20.0, 4.0, np.eye(4))
@@ -113,11 +113,11 @@ def test_a_run_has_an_outline_at_both_ends():
     expected = np.zeros(depth.shape, bool)
     expected[:, 10:25] = True
     np.testing.assert_array_equal(between_silhouettes(view), expected)
-    # An edge may be two pixels off, and no more.
+    # An edge may be off by two pixels, not by five.
     for shift, found in ((2, True), (-2, True), (5, False)):
         moved = replace(view, rgb=np.roll(rgb, shift, axis=1))
         assert between_silhouettes(moved)[:, 10:25].all() == found
-    # Along columns as along rows.
+    # Columns are treated as rows are.
     turned = replace(
         view,
         camera=Camera(8, 40, 30.0, 30.0, 4.0, 20.0, np.eye(4)),
@@ -126,13 +126,13 @@ def test_a_run_has_an_outline_at_both_ends():
         sharp=view.sharp.T,
     )
     np.testing.assert_array_equal(between_silhouettes(turned), expected.T)
-    # Nothing rendered is farther than everything.
+    # A rendered depth of zero counts as farther than any other.
     nothing = replace(view, rendered=np.where(depth > 5, 0, depth))
     np.testing.assert_array_equal(between_silhouettes(nothing), expected)
 
 
-def test_cubes_are_those_of_a_grid():
-    """Against sets of cells; points that are very far away are in none, and nothing overflows."""
+def test_cubes_agree_with_sets_of_grid_cells():
+    """Very distant points are in no cube, and integers do not overflow."""
     rng = np.random.default_rng(3)
     inside, others = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
     cubes = module._Cubes(np.vstack([inside, [[1e30, 0, -1e30]]]), 0.3)

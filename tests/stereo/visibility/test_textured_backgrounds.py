@@ -1,4 +1,4 @@
-"""Ground that was taken for background is found by its texture, the sky beside an outline is not."""
+"""Ground that training renders as background is found by its texture. Sky beside an outline is not."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HALO, SKY, NOISE = 4, 200.0, 4.0
 
 
 def waves(x: np.ndarray, y: np.ndarray, length: float) -> np.ndarray:
-    """A pattern without a period that is seen, of a few waves of about this length."""
+    """An aperiodic pattern of a few waves of about this length."""
     turns = np.random.default_rng(3).uniform(0, 2 * np.pi, (5, 2))
     steps = [(np.cos(a), np.sin(a)) for a, _ in turns]
     return sum(
@@ -27,8 +27,7 @@ def waves(x: np.ndarray, y: np.ndarray, length: float) -> np.ndarray:
 
 
 def photographs(ground=25.0, sky=0.0, cameras=CAMERAS, seed=0):
-    """(depth maps, backgrounds, known depths, what is ground in the background) of the scene; contrasts of ground and
-    sky."""
+    """(depth maps, backgrounds, known depths, ground pixels in the background). `ground` and `sky` are contrasts."""
     rng, maps, backgrounds, depths, far = np.random.default_rng(seed), [], [], [], []
     for camera in cameras:
         rays, eye = camera.world_rays(), camera.center
@@ -59,7 +58,7 @@ def photographs(ground=25.0, sky=0.0, cameras=CAMERAS, seed=0):
 
 
 def shares(found, far, backgrounds):
-    """Of the ground in backgrounds what share is found, and how many pixels of the sky."""
+    """Share of the ground in backgrounds that is found, and number of sky pixels that are."""
     found, far, backgrounds = (np.stack(each) for each in (found, far, backgrounds))
     assert not (found & ~backgrounds).any()
     return (found & far).sum() / far.sum(), (found & ~far).sum()
@@ -72,23 +71,23 @@ def test_far_ground_is_found_and_the_sky_beside_a_wall_is_not():
     )
     assert halo.sum() > 1000
     ground, sky = shares(textured_backgrounds(maps, backgrounds, known), far, backgrounds)
-    # Where the ground ends, its edge with the sky is texture.
+    # The edge between ground and sky counts as texture, so a few sky pixels are found.
     assert ground > 0.9 and sky < 0.1 * halo.sum()
 
 
-def test_clouds_beside_a_wall_are_at_infinity():
+def test_clouds_beside_a_wall_stay_background():
     maps, backgrounds, known, far = photographs(sky=12.0)
     ground, sky = shares(textured_backgrounds(maps, backgrounds, known), far, backgrounds)
     assert ground > 0.9 and sky < 250
 
 
-def test_ground_without_texture_stays():
+def test_ground_without_texture_stays_background():
     maps, backgrounds, known, far = photographs(ground=0.0)
     assert shares(textured_backgrounds(maps, backgrounds, known), far, backgrounds)[0] < 0.02
 
 
 @pytest.mark.parametrize("agreeing", [AGREEING - 1, AGREEING])
-def test_ground_that_few_views_know_stays(agreeing):
+def test_enough_views_must_know_the_ground(agreeing):
     maps, backgrounds, known, far = photographs()
     for depth in known[1 + agreeing :]:
         depth[:] = np.nan
@@ -96,17 +95,17 @@ def test_ground_that_few_views_know_stays(agreeing):
     assert (first.sum() > 0.5 * far[0].sum()) == (agreeing == AGREEING)
 
 
-def test_what_no_other_view_looks_past_is_not_at_infinity():
+def test_ground_is_found_if_it_is_background_in_one_view_only():
     maps, backgrounds, known, far = photographs()
     for own, ground in zip(backgrounds[1:], far[1:], strict=True):
         own &= ~ground
     assert textured_backgrounds(maps, backgrounds, known)[0][far[0]].mean() > 0.9
 
 
-def test_gaps_close_over_the_margin_but_not_into_the_sky():
+def test_small_gaps_are_closed_without_growing_into_the_sky():
     maps, backgrounds, known, far = photographs()
     rng = np.random.default_rng(1)
-    for own, ground in zip(backgrounds, far, strict=True):  # speckle that was not taken for background
+    for own, ground in zip(backgrounds, far, strict=True):  # single pixels that are not background
         own &= ~(ground & (rng.random(own.shape) < 0.01))
     ground, sky = shares(
         textured_backgrounds(maps, backgrounds, known),

@@ -1,4 +1,4 @@
-"""Thin things before a wall: a wire that training has is kept, and fog is not."""
+"""Thin objects in front of a wall: a rendered wire is kept, fog is not."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from helpers.captures import look_at
 
 from linprim_geo.stereo.visibility.thin_things import DEVIATIONS, RenderedView, channel_gains, thin_things
 
-# A wall at z = 0, seen from z = -3, and an upright wire of about four pixels 0.4 before it.
+# A wall at z = 0, seen from z = -3, and an upright wire of about four pixels, 0.4 in front of it.
 WIRE, HALF_WIDTH = 0.4, 0.055
 CAMERAS = [
     look_at((x, y, -3.0), (0.3 * x, 0.3 * y, 0.0), size=(96, 64), focal=110.0, up=(0.0, 1.0, 0.0))
@@ -19,7 +19,7 @@ CAMERAS = [
 
 
 def wall_colors(points):
-    """A texture as fine as stereo wants, (..., 3) grey values."""
+    """(..., 3) colours of a texture fine enough for stereo."""
     x, y = points[..., 0], points[..., 1]
     value = 110 + 30 * np.sin(9 * x + 2 * y) * np.cos(7 * y - x) + 20 * np.sin(23 * x) * np.sin(19 * y)
     return np.stack([value, 0.8 * value, 0.7 * value], -1)
@@ -31,7 +31,7 @@ def depth_at(camera, z):
 
 
 def view_of(camera, noise=0.0, seed=0, wire=(20, 30, 140)):
-    """What a view knows: the wire is rendered, and stereo knows the wall alone."""
+    """Return a view in which the wire is rendered and stereo knows only the wall, and the mask of the wire."""
     wall, front = depth_at(camera, 0.0), depth_at(camera, -WIRE)
     rays = camera.world_rays()
     on_wire = np.abs((camera.center + rays * front[..., None])[..., 0]) < HALF_WIDTH
@@ -51,17 +51,17 @@ def scene():
 
 
 def found_share(views, wires):
-    """Share of the wire that is found, and of what is found that is no wire."""
+    """Share of the wire that is found, and share of found pixels that are not on the wire."""
     found, wires = np.stack(thin_things(views)), np.stack(wires)
     return (found & wires).sum() / wires.sum(), (found & ~wires).sum() / max(found.sum(), 1)
 
 
-def test_a_wire_before_a_wall_is_found(scene):
+def test_a_wire_in_front_of_a_wall_is_found(scene):
     found, wrong = found_share(*scene)
     assert found > 0.7 and wrong == 0
 
 
-def test_noise_and_drifting_exposure_change_little(scene):
+def test_a_wire_is_found_under_noise_and_drifting_exposure(scene):
     pairs = [view_of(camera, 3.0, k, wire=(160, 130, 50)) for k, camera in enumerate(CAMERAS)]
     gains = np.exp(np.linspace(-0.2, 0.2, len(CAMERAS)))
     dimmed = [
@@ -72,8 +72,8 @@ def test_noise_and_drifting_exposure_change_little(scene):
     assert found > 0.6 and wrong == 0
 
 
-def test_fog_that_photographs_show_the_wall_at_is_none():
-    """Every view renders the same surface there, but the photographs are those of the wall alone."""
+def test_fog_is_rejected_where_photographs_show_the_wall():
+    """All views render the wire, but the photographs show the wall only."""
     views = []
     for camera in CAMERAS:
         view, _ = view_of(camera)
@@ -82,27 +82,27 @@ def test_fog_that_photographs_show_the_wall_at_is_none():
     assert not np.stack(thin_things(views)).any()
 
 
-def test_what_two_views_render_alone_is_none(scene):
+def test_four_views_must_render_the_wire(scene):
     views, _ = scene
 
     def rendered_by(count):
         nothing = [replace(view, rendered=np.zeros_like(view.rendered)) for view in views]
         return np.stack(thin_things([*views[:count], *nothing[count:]]))
 
-    # Three views render it, so two others than each; the rest renders nothing.
+    # With three views only two others agree with each; the remaining views render nothing.
     assert not rendered_by(3).any() and rendered_by(4).any()
 
 
-def test_what_many_see_through_is_none(scene):
+def test_a_wire_that_many_views_see_through_is_rejected(scene):
     views, wires = scene
-    # Four of eight views render it: of the others of each three agree, and four see through it.
+    # Four of eight views render it: for each of them three others agree and four see through it.
     half = [view if k % 2 else replace(view, rendered=view.known) for k, view in enumerate(views)]
     assert np.stack(thin_things(half)).sum() < 0.05 * np.stack(wires)[1::2].sum()
     most = [view if k < 7 else replace(view, rendered=view.known) for k, view in enumerate(views)]
     assert np.stack(thin_things(most)).sum() > 0.5 * np.stack(wires)[:7].sum()
 
 
-def test_what_is_not_sharp_is_none(scene):
+def test_blurred_depths_are_rejected(scene):
     views, _ = scene
     fog = [replace(view, sharp=~view.sharp) for view in views]
     first, *others = thin_things([fog[0], *views[1:]])
@@ -111,9 +111,9 @@ def test_what_is_not_sharp_is_none(scene):
 
 
 @pytest.mark.parametrize(("part", "found"), [(0.5, False), (2.0, True)])
-def test_a_wire_that_noise_could_be_is_none(part, found):
-    """Differences of means of nine pixels of channels with twice the noise of grey values have a deviation of 2/3 of
-    it."""
+def test_contrast_must_exceed_the_noise(part, found):
+    """The difference of two means of nine pixels has 2/3 of the deviation of grey values; channels have twice their
+    variance."""
     views, noise = [], 8.0
     for camera in CAMERAS:
         view, on_wire = view_of(camera)
@@ -123,8 +123,8 @@ def test_a_wire_that_noise_could_be_is_none(part, found):
     assert np.stack(thin_things(views)).any() == found
 
 
-def test_pixels_that_pass_by_chance_are_none(scene):
-    """A region that is rendered before the wall, of which photographs agree at one row in twelve alone."""
+def test_isolated_agreeing_pixels_are_rejected(scene):
+    """A surface is rendered in front of the wall, but photographs agree with it in one row of twelve only."""
     views, _ = scene
     changed, lone = [], 0
     for view in views:
@@ -140,7 +140,7 @@ def test_pixels_that_pass_by_chance_are_none(scene):
     assert np.stack(thin_things(changed)).sum() < 0.1 * lone
 
 
-def test_without_known_depths_or_light_nothing_is_found(scene):
+def test_unknown_depths_and_black_photographs_find_nothing(scene):
     views, _ = scene
     unknown = [replace(view, known=np.full_like(view.known, np.nan)) for view in views]
     assert not np.stack(thin_things(unknown)).any()

@@ -1,4 +1,4 @@
-"""Surfaces that span what is known: flat walls with gaps, steps, things seen through, and a closed body."""
+"""Surfaces that span gaps between known depths: flat walls, steps, see-through surfaces, and a closed body."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def areas(corners: np.ndarray) -> np.ndarray:
 
 
 def with_gap(low: float, high: float, beyond=WALL) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Depths that are not known between two x of the world, after which another plane may begin; and the gap (H, W)."""
+    """Depths that are unknown between two world x, with plane `beyond` behind the gap; and masks of the gap, (H, W)."""
     known, gaps = [], []
     for camera in CAMERAS:
         near, far = depth_of(camera, WALL), depth_of(camera, beyond)
@@ -60,8 +60,8 @@ def test_a_gap_in_a_wall_is_spanned_by_the_wall():
         assert np.nanmax(np.abs(depth / depth_of(camera, WALL) - 1)[gap]) < 1e-3
 
 
-def test_cameras_at_one_place_are_both_asked():
-    """Only one of them is a corner of tetrahedra; the second knows nothing, or alone something."""
+def test_two_cameras_at_the_same_place_are_both_used():
+    """Only one of the two cameras is a vertex of the tetrahedra. Either the first or the second has known depths."""
     known, gaps = with_gap(-0.4, 0.4)
     nothing = [np.full_like(depth, np.nan) for depth in known]
     for order in ([*known, *nothing], [*nothing, *known]):
@@ -80,7 +80,7 @@ def test_a_step_is_not_spanned():
         assert gap.mean() > 0.1 and np.isfinite(depth[gap]).mean() < 0.05
 
 
-def test_what_training_sees_through_is_not_spanned():
+def test_gaps_that_rendered_depths_see_through_are_not_spanned():
     known, gaps = with_gap(-0.4, 0.4)
     points = points_of(CAMERAS, known)
     for factor, spanned in ((1.0, True), (1.04, True), (1.2, False)):
@@ -91,8 +91,8 @@ def test_what_training_sees_through_is_not_spanned():
 
 
 @pytest.mark.parametrize(("views_that_see_through", "spanned"), [(4, True), (3, True), (2, False), (0, False)])
-def test_what_is_rendered_before_a_span_is_fog_where_three_views_see_through_it(views_that_see_through, spanned):
-    """The first view does not know the gap, some of the others do, and the rest know nothing at all."""
+def test_three_views_that_see_through_a_rendered_surface_make_it_fog(views_that_see_through, spanned):
+    """The first view has no depths in the gap. Some other views have depths behind it, the others have none at all."""
     known, gaps = with_gap(-0.4, 0.4)
     for view in range(1, 5):
         known[view] = depth_of(CAMERAS[view], WALL) if view <= views_that_see_through else np.full((48, 64), np.nan)
@@ -103,8 +103,8 @@ def test_what_is_rendered_before_a_span_is_fog_where_three_views_see_through_it(
         assert (np.isfinite(depth) if expected else np.isnan(depth)).mean() > 0.9
 
 
-def test_things_that_some_views_know_are_not_fog():
-    """Three views see through a thing that a fourth one knows."""
+def test_a_surface_known_in_one_view_is_no_fog():
+    """Three views see through a surface that the fourth has depths on."""
     known, gaps = with_gap(-0.4, 0.4)
     for view in range(1, 5):
         known[view] = depth_of(CAMERAS[view], WALL)
@@ -115,9 +115,9 @@ def test_things_that_some_views_know_are_not_fog():
     assert np.isfinite(depth).mean() < 0.1
 
 
-def test_rays_to_primitives_go_through_holes(monkeypatch):
-    """A hole in the wall, and the other one behind its right end: unless something is rendered behind the hole, the
-    boundary closes it."""
+def test_rendered_surfaces_behind_a_hole_keep_it_open(monkeypatch):
+    """The wall has a hole, and a second wall stands behind its right end. The boundary closes the hole unless the
+    second wall is rendered behind it."""
     monkeypatch.setattr(visibility_cut, "PIXELS_PER_POINT", 3)
     known, _ = with_gap(0.0, 1.0, BACK)
     for camera, depth in zip(CAMERAS, known, strict=True):
@@ -133,14 +133,14 @@ def test_rays_to_primitives_go_through_holes(monkeypatch):
     assert closed[0] > 1 and closed[1] == 0
 
 
-def test_points_are_as_many_as_pixels_allow_up_to_a_bound():
+def test_number_of_points_follows_pixels_up_to_a_limit():
     assert points_per_view(CAMERAS) == -(-(5 * 64 * 48 // 200) // 5)
     large = [look_at((0.0, -3.0, 1.0), size=(2000, 1000), focal=60.0)]
     assert points_per_view(large) == 10_000 and points_per_view(20 * large) == 2_000
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-def test_a_few_points_span_nothing(count):
+def test_three_points_or_fewer_span_nothing(count):
     known = [np.full((48, 64), np.nan) for _ in CAMERAS]
     known[0].ravel()[:count] = 3.0
     rendered = [depth_of(camera, WALL) for camera in CAMERAS]
@@ -170,7 +170,7 @@ def test_the_boundary_around_a_sphere_is_the_sphere():
     assert surface.continued[seen].mean() > 0.9
 
 
-def test_normals_of_planes_are_exact_up_to_their_ends():
+def test_plane_normals_are_exact_and_zero_where_unknown():
     for plane in (WALL, BACK):
         depth = depth_of(CAMERAS[0], plane)
         depth[:, 40:], depth[30:] = np.nan, np.nan
