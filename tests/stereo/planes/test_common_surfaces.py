@@ -1,4 +1,4 @@
-"""Surfaces that several views know, and what two alone suppose."""
+"""Support of a surface by other views: confirmed depths, and depths by planes of their regions."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ def numbers(surfaces, supposed) -> list[list[int]]:
     return [views.tolist() for views in surfaces.supporting_views(0, supposed, len(supposed) * [False])]
 
 
-def test_views_that_see_the_same_surface_know_it(supposed):
+def test_views_with_the_same_surface_support_it(supposed):
     assert (supposed[1][:40] > 1.2 * supposed[0][:40]).all()
     assert numbers(known([WALL] * 5), supposed) == [[1, 2, 3, 4], []]
     assert numbers(known([FLOOR, FLOOR, WALL, WALL, WALL]), supposed) == [[2, 3, 4], [1]]
     assert numbers(known([WALL, None, None, None, FLOOR]), supposed) == [[], [4]]
 
 
-def test_a_view_is_no_witness_of_its_own_and_nothing_is_known_of_nothing(supposed):
+def test_a_view_does_not_support_itself(supposed):
     assert numbers(known([WALL, None, None, None, None]), supposed) == [[], []]
     assert numbers(known([None] * 5), supposed) == [[], []]
     assert numbers(known([WALL] * 5), []) == []
 
 
-def test_a_few_points_are_no_surface(supposed):
+def test_a_few_points_give_no_support(supposed):
     few = depth_of(CAMERAS[1], WALL)
     few[STRIDE:] = np.nan  # one row of points
     assert 80 // STRIDE < LEAST_POINTS
@@ -57,13 +57,13 @@ def test_a_few_points_are_no_surface(supposed):
     assert numbers(surfaces, supposed) == [[], []]
 
 
-def test_depths_that_differ_by_less_than_planes_are_off_by_are_one_surface():
+def test_surfaces_match_within_5_percent_of_depth():
     middle = np.full((60, 80), 3.0)
     near, far = (SurfaceSupport(2 * CAMERAS[:1], [middle, middle * z], 2 * [NOTHING]) for z in (1.045, 1.055))
     assert numbers(near, [middle]) == [[1]] and numbers(far, [middle]) == [[]]
 
 
-def test_what_views_only_suppose_is_known_where_it_need_not_be_confirmed(supposed):
+def test_supposed_depths_count_unless_confirmation_is_required(supposed):
     walls = [depth_of(camera, WALL) for camera in CAMERAS]
     surfaces = SurfaceSupport(CAMERAS, [NOTHING, walls[1], NOTHING, NOTHING, NOTHING], [NOTHING, NOTHING, *walls[2:]])
     wall = [depth_of(CAMERAS[0], WALL)]

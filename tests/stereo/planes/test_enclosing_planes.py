@@ -1,4 +1,4 @@
-"""Floors and walls that go on where nothing is known of them, in a corner of a room with exact depths."""
+"""Floors and walls that are extended into unknown areas, in a corner of a room with exact depths."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CAMERAS = [
 
 
 def depth_of(camera, planes) -> np.ndarray:
-    """(H, W) depth of the first of some planes, NaN without one."""
+    """(H, W) depth of the nearest of some planes, NaN where no ray meets one."""
     with np.errstate(divide="ignore"):
         nearest = (camera.ray_grid() @ in_camera(camera, np.array(planes)).T).max(-1)
         return np.where(nearest > 0, 1 / nearest, np.nan)
@@ -43,7 +43,7 @@ def places_of(camera, depth) -> np.ndarray:
 
 
 def points_of(known) -> SurfacePoints:
-    """Of all known pixels of all views, with the normals of the floor and the walls."""
+    """Points of all known pixels of all views, with normals of the floor and the walls."""
     parts = []
     for view, (camera, depth) in enumerate(zip(CAMERAS, known, strict=True)):
         on = np.abs(places_of(camera, np.nan_to_num(depth))).argmin(-1)
@@ -52,13 +52,13 @@ def points_of(known) -> SurfacePoints:
 
 
 def room(unknown) -> list[np.ndarray]:
-    """Depth of the corner in every view, NaN where `unknown` says so of its (H, W, 3) places."""
+    """Depth of the corner in every view, NaN where `unknown` is true for its (H, W, 3) places."""
     whole = [depth_of(camera, [FLOOR, WALL, SIDE]) for camera in CAMERAS]
     return [np.where(unknown(places_of(c, depth)), np.nan, depth) for c, depth in zip(CAMERAS, whole, strict=True)]
 
 
 def ending(cameras, planes, known, wanted) -> list[np.ndarray]:
-    """Depths of `enclosing_depths` where no depth is more probable than others."""
+    """`enclosing_depths` without probable or doubtful depths."""
     nothing = [np.full(depth.shape, np.nan) for depth in known]
     return enclosing_depths(cameras, planes, known, wanted, nothing, nothing)
 
@@ -67,8 +67,8 @@ def normals(found: list[EnclosingPlane]) -> set:
     return {tuple(np.round(plane.normal, 6) + 0.0) for plane in found}
 
 
-def test_of_a_wall_that_stands_on_a_line_few_points_are_enough():
-    def hardly_any(place):  # of the wall at y = 0
+def test_a_wall_on_a_meeting_line_needs_few_points():
+    def hardly_any(place):  # leaves a strip of the wall at y = 0
         return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., 0] - 1) > 0.02)
 
     points, planes = points_of(room(hardly_any)), np.array([FLOOR, WALL])
@@ -84,14 +84,14 @@ def everything(place):
     return np.zeros(place.shape[:2], bool)
 
 
-def test_floor_and_walls_enclose_a_corner_whichever_way_their_normals_are():
+def test_floor_and_walls_enclose_a_corner_for_either_sign_of_normals():
     points = points_of(room(everything))
     found = enclosing_planes(CAMERAS, np.array([FLOOR, -WALL, SIDE]), points)
     assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)} and len(found) == 3
     assert all(abs(plane.offset) < 1e-9 for plane in found)
 
 
-def test_a_copy_and_a_table_do_not_enclose():
+def test_a_duplicate_and_a_table_do_not_enclose():
     known = room(everything)
     copy, table = np.array([0.02, 0, 1, 0.01]), np.array([0.0, 0, 1, 0.5])
     copy[:3] /= np.linalg.norm(copy[:3])
@@ -99,7 +99,7 @@ def test_a_copy_and_a_table_do_not_enclose():
     assert normals(found) == {(0, 0, 1), (0, 1, 0), (1, 0, 0)}
 
 
-def test_a_plane_that_meets_no_other_at_a_right_angle_ends_with_its_points():
+def test_a_plane_without_right_angles_ends_with_its_points():
     found = enclosing_planes(CAMERAS, FLOOR[None], points_of(room(everything)))
     assert normals(found) == {(0, 0, 1)} and found[0].whole is found[0].own
     slope = np.array([0, 0.5**0.5, 0.5**0.5, 0])
@@ -107,8 +107,8 @@ def test_a_plane_that_meets_no_other_at_a_right_angle_ends_with_its_points():
     assert normals(both) == {(0, 0, 1)}  # few points are on the slope
 
 
-def test_alone_a_plane_has_points_all_over():
-    """The floor is known along both walls only, as a plane over a row of eaves is."""
+def test_a_single_plane_needs_points_over_its_whole_area():
+    """The floor is known along the two walls only."""
 
     def inside(place):
         return (np.abs(place[..., 2]) < 1e-6) & (place[..., :2] > 0.2).all(-1)
@@ -118,7 +118,7 @@ def test_alone_a_plane_has_points_all_over():
     assert normals(enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points)) >= {(0, 0, 1), (0, 1, 0)}
 
 
-def test_the_rectangle_of_a_plane_alone_is_the_smallest():
+def test_a_single_plane_has_the_smallest_enclosing_rectangle():
     turn = np.array([[np.cos(0.5), np.sin(0.5), 0], [-np.sin(0.5), np.cos(0.5), 0]])
     size = np.array([0.6, 0.3])
 
@@ -132,14 +132,14 @@ def test_the_rectangle_of_a_plane_alone_is_the_smallest():
     np.testing.assert_allclose(sides, 2 * size[::-1], atol=0.1)
 
 
-def test_a_plane_that_only_crosses_the_others_does_not_enclose():
+def test_a_plane_through_the_edge_of_two_walls_does_not_enclose():
     across = np.array([0.5**0.5, 0.5**0.5, 0, 0])  # through the edge between the walls
     found = enclosing_planes(CAMERAS, np.array([FLOOR, across]), points_of(room(everything)))
     assert normals(found) == {(0, 0, 1)}
 
 
-def test_the_front_of_a_sideboard_ends_where_its_own_points_do():
-    """Nothing is known behind it; the floor goes on beside it, and lies on its plane, too."""
+def test_the_front_of_a_sideboard_ends_with_its_own_points():
+    """Nothing is known behind it. The floor continues beside it and has points on its plane, too."""
     planes = np.array([SIDE, [0.0, 1, 0, 0.4], FLOOR])
     parts = []
     for view, camera in enumerate(CAMERAS):
@@ -157,12 +157,12 @@ def test_the_front_of_a_sideboard_ends_where_its_own_points_do():
     np.testing.assert_array_equal(front.whole, front.own)
 
 
-def test_a_camera_or_points_behind_a_plane_speak_against_it():
+def test_cameras_or_points_behind_a_plane_refute_it():
     points = points_of(room(everything))
     planes = np.array([FLOOR, WALL, SIDE])
     below = [*CAMERAS, look_at((2.0, 2.0, -0.5), size=SIZE)]
     assert (0, 0, 1) not in normals(enclosing_planes(below, planes, points))
-    # Of the points that move, a half to two thirds are then behind each plane; hardly any lies in a recess of it.
+    # A half to two thirds of the moved points lie behind each plane, hardly any within the depth of a recess.
     for share, left in ((0.005, {(0, 0, 1), (0, 1, 0), (1, 0, 0)}), (0.02, {(0, 0, 1)}), (0.03, set())):
         count = int(share * len(points))
         moved = points.position.copy()
@@ -175,7 +175,7 @@ def test_a_camera_or_points_behind_a_plane_speak_against_it():
 
 @pytest.mark.parametrize(("share", "back", "holds"), [(0.04, 1.04, True), (0.07, 1.04, False), (0.04, 1.1, False)])
 def test_a_door_in_a_recess_does_not_open_a_wall(share, back, holds):
-    """So many points lie that much farther along their rays."""
+    """A `share` of all points, on the wall, is moved along its rays by the factor `back`."""
     points = points_of(room(everything))
     moved = points.position.copy()
     door = np.flatnonzero(np.abs(moved[:, 1]) < 1e-6)[: int(share * len(points))]
@@ -184,8 +184,8 @@ def test_a_door_in_a_recess_does_not_open_a_wall(share, back, holds):
     assert ((0, 1, 0) in normals(found)) == holds
 
 
-def test_a_plane_between_a_floor_and_a_board_above_is_a_copy_of_the_floor():
-    """More points are on it than on either, and those of a hole in the floor are behind it alone."""
+def test_a_plane_between_floor_and_board_is_a_duplicate_of_the_floor():
+    """More points lie on it than on either surface, and points in a hole of the floor lie behind it only."""
     rng, above = np.random.default_rng(0), look_at((0.3, 0.0, 3.2), (0.0, 0.0, 0.0), size=SIZE)
     level = np.repeat([0.0, 0.06, -0.05], [400, 500, 30])
     places = np.column_stack([rng.uniform(-0.3, 0.3, (len(level), 2)), level])
@@ -198,8 +198,8 @@ def test_a_plane_between_a_floor_and_a_board_above_is_a_copy_of_the_floor():
     assert [plane.tolist() for plane in seen.without_copies([between, FLOOR])] == [FLOOR.tolist()]
 
 
-def test_a_wall_without_points_closes_the_room_where_the_others_end():
-    """The wall at x = 0 is unknown; the floor and the other wall end there, and nothing lies behind."""
+def test_a_wall_without_points_is_placed_where_other_planes_end():
+    """The wall at x = 0 is unknown. The floor and the other wall end there, and no points lie behind it."""
     known = room(lambda place: np.abs(place[..., 0]) < 1e-6)
     found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points_of(known))
     sides = [plane for plane in found if plane.normal[0] > 0.99]
@@ -212,11 +212,11 @@ def test_a_wall_without_points_closes_the_room_where_the_others_end():
         assert there.sum() > 0.8 * pixels.sum() and np.abs(ours / theirs - 1)[there].max() < 0.03
 
 
-def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
+def test_no_wall_is_placed_where_floor_and_wall_end_apart():
     known = room(lambda place: (place[..., 0] < 0.5) & (place[..., 2] > 1e-6) | (np.abs(place[..., 0]) < 1e-6))
     points = points_of(known)
     on_floor = np.flatnonzero(points.normal[:, 2] > 0.5)
-    for few in (False, True):  # so few that nearly all points lie on one side of a plane between the ends
+    for few in (False, True):  # few points on the floor: nearly all points are on one side of a plane between the ends
         kept = np.ones(len(points), bool)
         kept[on_floor[len(points) // 25 :] if few else []] = False
         found = enclosing_planes(CAMERAS, np.array([FLOOR, WALL]), points[kept])
@@ -224,8 +224,8 @@ def test_where_floor_and_wall_end_at_different_places_nothing_closes_the_room():
 
 
 @pytest.mark.parametrize(("gap", "apart", "closes"), [(0.075, 1.2, True), (0.091, 1.54, False)])
-def test_two_ends_that_are_each_known_to_a_margin_are_at_the_same_place(gap, apart, closes):
-    """The floor has no points up to a gap from the corner; the ends then differ by so many margins."""
+def test_ends_match_within_their_combined_margins(gap, apart, closes):
+    """The floor has no points within `gap` of the corner, so that the ends differ by `apart` margins."""
     points = points_of(room(lambda place: np.abs(place[..., 0]) < 1e-6))
     points = points[(np.abs(points.position[:, 2]) > 1e-6) | (points.position[:, 0] > gap)]
     seen = ScenePoints(CAMERAS, points)
@@ -237,8 +237,8 @@ def test_two_ends_that_are_each_known_to_a_margin_are_at_the_same_place(gap, apa
     assert [plane.closes for plane in found] == [False, False, True][: 2 + closes]
 
 
-def test_nothing_closes_the_room_before_further_points():
-    """Stereo sees floor and wall up to 0.3 m before their corner; planes of plain regions go on."""
+def test_no_wall_is_placed_in_front_of_known_points():
+    """Stereo has points of floor and wall up to 0.3 m from the corner, planes of plain regions give the others."""
     planes, seen = np.array([FLOOR, WALL]), points_of(room(lambda place: place[..., 0] < 0.3))
     (side,) = [plane for plane in enclosing_planes(CAMERAS, planes, seen) if plane.closes]
     assert side.normal[0] > 0.99 and side.offset == pytest.approx(0.3, abs=0.06)
@@ -250,7 +250,7 @@ def test_nothing_closes_the_room_before_further_points():
         assert corners[0] == pytest.approx(0, abs=0.1) and corners[1] == pytest.approx(0.3, abs=0.1)
 
 
-def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
+def test_a_gap_in_a_wall_is_filled_only_at_wanted_pixels():
     def gap(place):
         return (np.abs(place[..., 1]) < 1e-6) & (np.abs(place[..., :3:2] - (0.9, 0.6)) < 0.3).all(-1)
 
@@ -261,12 +261,12 @@ def test_a_gap_in_a_wall_is_filled_where_it_is_wanted_and_no_more():
     filled = ending(CAMERAS, found, known, wanted)
     assert np.isnan(filled[0]).all()
     for ours, theirs, pixels in list(zip(filled, truth, wanted, strict=True))[1:]:
-        there = np.isfinite(ours)  # but at its border, where pixels of other views know what is beside the gap
+        there = np.isfinite(ours)  # not at the border of the gap, where other views know depths beside it
         assert there.sum() > 0.7 * pixels.sum() > 0 and pixels[there].all()
         np.testing.assert_allclose(ours[there], theirs[there], rtol=1e-5)
 
 
-def test_a_wall_does_not_go_on_beyond_its_points_but_where_hardly_any_view_looks():
+def test_a_wall_extends_beyond_its_points_only_where_few_views_look():
     plane = EnclosingPlane(
         WALL[:3],
         0.0,
@@ -286,8 +286,8 @@ def test_a_wall_does_not_go_on_beyond_its_points_but_where_hardly_any_view_looks
 
 
 @pytest.mark.parametrize("knowing, filled", [(3, True), (4, False)])
-def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled):
-    """Of six views that look at a wall some know it: the first does not, so something is before it in most cases."""
+def test_a_place_known_by_most_views_is_not_filled_in_others(knowing, filled):
+    """Six views look at a wall and `knowing` of them know it. If most do, the first sees something in front of it."""
     whole = [depth_of(camera, [WALL]) for camera in CAMERAS]
     known = [depth if 0 < view <= knowing else np.full_like(depth, np.nan) for view, depth in enumerate(whole)]
     ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
@@ -296,7 +296,7 @@ def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled
     wanted[0][18, 24] = True  # the middle, which all of them have in the image
     depth = ending(CAMERAS, [plane], known, wanted)[0]
     assert np.isfinite(depth).sum() == filled
-    # One that doubts a depth does see it if that is near.
+    # A doubtful depth of the first view near the wall counts as seeing it.
     nothing = [np.full(depth.shape, np.nan) for depth in whole]
     for factor, near in ((0.97, True), (1.03, True), (0.9, False), (1.1, False)):
         doubtful = [factor * whole[0], *nothing[1:]]
@@ -304,7 +304,7 @@ def test_a_place_that_most_views_know_is_not_what_the_others_see(knowing, filled
         assert np.isfinite(depth).sum() == (filled or near)
 
 
-def test_where_a_depth_is_probable_the_plane_is_near_it():
+def test_a_plane_fills_only_near_probable_depths():
     ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
     plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
     wall = depth_of(CAMERAS[0], [WALL])
@@ -317,8 +317,8 @@ def test_where_a_depth_is_probable_the_plane_is_near_it():
 
 
 @pytest.mark.parametrize("views, knowing, counts", [(4, 3, True), (4, 2, False), (6, 6, False)])
-def test_what_few_views_know_on_a_plane_counts(views, knowing, counts):
-    """Of `views` that look at a wall `knowing` know it, and in one of these a part that is before it."""
+def test_known_depths_on_a_plane_count_where_few_views_look(views, knowing, counts):
+    """`knowing` of `views` views know the wall. In one of them a part has depths in front of it."""
     ends = np.array([[-9.0, -9.0], [9.0, 9.0]])
     plane = EnclosingPlane(WALL[:3], 0.0, np.array([[1.0, 0, 0], [0, 0, 1]]), ends, ends)
     whole = [depth_of(camera, [WALL]) for camera in CAMERAS[:views]]
@@ -331,7 +331,7 @@ def test_what_few_views_know_on_a_plane_counts(views, knowing, counts):
     assert not any(pixels.any() for pixels in known_on_planes(CAMERAS[:views], [elsewhere], known))
 
 
-def test_without_points_or_planes_there_is_nothing():
+def test_no_points_or_planes_give_no_depths():
     known = room(everything)
     points = points_of(known)
     nobody = points[np.zeros(len(points), bool)]
@@ -342,12 +342,12 @@ def test_without_points_or_planes_there_is_nothing():
 
 
 def plain_region(camera, mask: np.ndarray) -> PlainRegion:
-    """All of an image that is in a mask."""
+    """A region with the pixels of a mask."""
     return PlainRegion(0, 0, 0, mask, np.zeros((0, 3)), np.zeros(0), *np.zeros((2, 0), bool), np.zeros((5, 3)), mask)
 
 
 def wall_and_region():
-    """A camera, two enclosing planes, the true depth, and the upper part of the image, which lies on both."""
+    """A camera, the enclosing planes, the true depth, and a mask of the upper part of the image."""
     planes = [plane for plane in enclosing_planes(CAMERAS, np.array([FLOOR, WALL, SIDE]), points_of(room(everything)))]
     camera = CAMERAS[0]
     true = depth_of(camera, [FLOOR, WALL, SIDE])
@@ -357,7 +357,7 @@ def wall_and_region():
 
 
 @pytest.mark.parametrize(("known_share", "on_share", "lies"), [(0.5, 1.0, True), (0.5, 0.6, False), (0.05, 1.0, False)])
-def test_a_plain_region_lies_on_the_planes_that_most_of_what_is_known_in_it_lies_on(known_share, on_share, lies):
+def test_a_plain_region_takes_planes_that_most_of_its_known_depths_lie_on(known_share, on_share, lies):
     camera, planes, true, mask = wall_and_region()
     number = np.random.default_rng(0).permutation(mask.size).reshape(mask.shape) / mask.size
     known = np.where(number < known_share, true, np.nan)
@@ -372,7 +372,7 @@ def test_a_plain_region_lies_on_the_planes_that_most_of_what_is_known_in_it_lies
         assert np.isnan(region_depths(camera, [], known, [plain_region(camera, mask)])).all()
 
 
-def test_a_plain_region_goes_no_farther_than_its_planes():
+def test_a_plain_region_is_filled_only_within_its_planes():
     camera, planes, true, mask = wall_and_region()
     smaller = [plane.own.mean(0) + 0.4 * (plane.own - plane.own.mean(0)) for plane in planes]
     low = [replace(plane, own=ends, whole=ends) for plane, ends in zip(planes, smaller, strict=True)]
@@ -387,8 +387,8 @@ def test_a_plain_region_goes_no_farther_than_its_planes():
     assert (np.isfinite(depth) == (within & mask)).all()
 
 
-def test_what_a_gap_in_an_edge_joins_to_a_wall_does_not_lie_on_it():
-    """A bed before a wall: of what is known next to its unknown pixels nothing is on the wall."""
+def test_an_object_joined_to_a_wall_region_is_not_put_on_the_wall():
+    """A bed in front of a wall: known depths next to its unknown pixels are not on the wall."""
     camera, planes, true, mask = wall_and_region()
     bed = mask & (np.arange(mask.shape[1]) >= 36)
     known = np.where(np.indices(mask.shape).sum(0) % 3 == 0, np.where(bed, 0.8, 1.0) * true, np.nan)

@@ -1,5 +1,5 @@
-"""Planes by edges in a room whose floor and side wall have points: of a cupboard and a door nearly flush with it, and
-of what leans by itself."""
+"""Planes by edges in a room whose floor and side wall have points: a cupboard nearly flush with a door, and surfaces
+that lean."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ CAMERAS = [look_at((x, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) f
 
 
 def edges_of(points: np.ndarray) -> list[PlainRegion]:
-    """A region of every view with these (P, 3) points along its edges."""
+    """One region per view with these (P, 3) points along its edges."""
     return [region_of(view, camera, points) for view, camera in enumerate(CAMERAS)]
 
 
 def region_of(view: int, camera: Camera, points: np.ndarray) -> PlainRegion:
-    """With these (P, 3) points along its edges."""
+    """A region with these (P, 3) points along its edges."""
     one, (pixels, depth) = np.ones((1, 1), bool), camera.project(points)
     rays, sure = rays_of(camera, pixels[:, 1] - 0.5, pixels[:, 0] - 0.5), np.ones(len(points), bool)
     return PlainRegion(view, 0, 0, one, rays, 1 / depth, sure, sure, rays[:5], one)
 
 
 def outline(low: float, high: float, count: int) -> np.ndarray:
-    """(count, 2) places of x and z along the outline of something between these x, 2 high."""
+    """(count, 2) random x and z on the outline of a rectangle between these x, 2 high."""
     rng = np.random.default_rng(0)
     x, z = rng.uniform(low, high, count), rng.uniform(0, 2, count)
     side = rng.integers(0, 4, count)
@@ -39,7 +39,7 @@ def outline(low: float, high: float, count: int) -> np.ndarray:
 
 
 def facing(places: np.ndarray, y: np.ndarray | float, noise: float = 0.004) -> np.ndarray:
-    """(P, 3) points at places of x and z whose y is known but for noise."""
+    """(P, 3) points at these x and z, with noise in y."""
     y = y + np.random.default_rng(1).normal(scale=noise, size=len(places))
     return np.column_stack([places[:, 0], y, places[:, 1]])
 
@@ -51,8 +51,8 @@ def plane_through(points: np.ndarray) -> np.ndarray:
     return np.append(normal, normal @ middle)
 
 
-def test_of_two_faces_that_are_nearly_flush_a_plane_takes_the_one_with_more_points():
-    """The plane with the most points leans by 2 degrees, from the door to a cupboard that is 3 cm before it."""
+def test_a_plane_across_two_nearly_flush_faces_takes_the_one_with_more_points():
+    """A plane fitted to both leans by 0.5 to 3 degrees, from the door to a cupboard 3 cm in front of it."""
     door, cupboard = facing(outline(-1.2, 0.0, 300), 0.0), facing(outline(0.0, 0.8, 120), 0.03)
     points = np.concatenate([door, cupboard])
     leaning = plane_through(points)
@@ -64,7 +64,7 @@ def test_of_two_faces_that_are_nearly_flush_a_plane_takes_the_one_with_more_poin
 
 
 @pytest.mark.parametrize("degrees", [3.0, 15.0])
-def test_a_plane_that_leans_by_itself_stays(degrees):
+def test_a_leaning_surface_is_not_turned(degrees):
     places = outline(-1.2, 0.8, 300)
     points = facing(places, np.tan(np.radians(degrees)) * (places[:, 1] - 1))
     leaning = plane_through(points)
@@ -72,8 +72,8 @@ def test_a_plane_that_leans_by_itself_stays(degrees):
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_plane_whose_points_are_all_far_from_it_once_it_is_turned_stays():
-    """Two posts that stand askew to the room."""
+def test_a_plane_that_would_lose_its_points_is_not_turned():
+    """Two posts on a plane at 18 degrees to the room."""
     places = np.repeat([[-1.0, 0.0], [1.0, 0.0]], 60, axis=0)
     places[:, 1] = np.tile(np.linspace(0.2, 1.8, 60), 2)
     points = facing(places, np.tan(np.radians(18)) * places[:, 0], noise=0.0)
@@ -81,8 +81,8 @@ def test_a_plane_whose_points_are_all_far_from_it_once_it_is_turned_stays():
     assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
 
 
-def test_of_copies_the_first_is_left():
-    """Planes that lean to both sides of one door, and one of a wall behind it."""
+def test_duplicates_are_merged_after_turning():
+    """Two planes of a door lean to either side; a third is that of a wall behind it."""
     door, wall = facing(outline(-1.2, 0.0, 300), 0.0), facing(outline(-1.2, 0.8, 300), -0.3)
     lean = np.radians(1)
     sides = np.array([[s * np.sin(lean), np.cos(lean), 0.0, -0.6 * s * np.sin(lean)] for s in (1, -1)])
@@ -91,16 +91,16 @@ def test_of_copies_the_first_is_left():
     np.testing.assert_allclose(found, [[0, 1, 0, 0], [0, 1, 0, -0.3]], atol=0.002)
 
 
-def test_without_a_frame_nothing_turns():
+def test_no_plane_is_turned_without_a_frame():
     points = facing(outline(-1.2, 0.0, 300), 0.0)
     planes = np.array([[0.01, np.sqrt(1 - 1e-4), 0.0, 0.0]])
     for by_points in (ROOM[:1], np.zeros((0, 4))):
         assert along_frame(CAMERAS, edges_of(points), planes, by_points) is planes
 
 
-def seen_askew(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
-    """Cameras so far apart, and a wall y = 0 in each: its corner is known, the skirting from there on leans by 9
-    degrees, to one side or the other."""
+def leaning_skirtings(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
+    """Cameras `apart` from each other, and a region of the wall y = 0 in each: points at its corner are exact, those
+    of the skirting lean by 9 degrees to alternating sides."""
     cameras = [look_at((x * apart, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) for x in (-1, 0, 1)]
     corner = np.column_stack([np.full(150, -0.5), np.linspace(0, 2, 150)])
     skirting = np.column_stack([np.linspace(-0.5, 0.0, 40), np.zeros(40)])
@@ -112,14 +112,13 @@ def seen_askew(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
     return cameras, regions
 
 
-def test_planes_that_lean_to_all_sides_agree_along_the_frame():
-    cameras, regions = seen_askew(1.0)
+def test_planes_that_lean_differently_agree_after_turning_along_the_frame():
+    cameras, regions = leaning_skirtings(1.0)
     assert not len(common_planes(cameras, regions))
     (plane,) = planes_by_edges(cameras, regions, ROOM)
     np.testing.assert_allclose(np.abs(plane), [0, 1, 0, 0], atol=0.003)
     assert not len(planes_by_edges(cameras, regions, ROOM[:1]))  # no frame
 
 
-def test_views_from_one_direction_are_one():
-    """Of 2 degrees."""
-    assert not len(planes_by_edges(*seen_askew(0.04), ROOM))
+def test_views_2_degrees_apart_count_as_one():
+    assert not len(planes_by_edges(*leaning_skirtings(0.04), ROOM))

@@ -1,4 +1,4 @@
-"""Walls of a room that is not convex, of one grey each, in photographs with noise."""
+"""Walls of a non-convex room, each of one grey value, in photographs with noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from linprim_geo.stereo.planes.room_corners import with_corner_walls
 # An L of 5 by 6 m and 2.4 m high, without the part beyond x > 2 and y > 2.5: two boxes that overlap.
 HEIGHT, INNER = 2.4, (2.0, 2.5)
 BOXES = (((0.0, 0.0, 0.0), (2.0, 6.0, HEIGHT)), ((0.0, 0.0, 0.0), (5.0, 2.5, HEIGHT)))
-# Of the floor and the ceiling, then of the six walls by the axis they are across and where they are.
+# Grey values of floor and ceiling, and of the six walls by the axis of their normal and their position.
 LEVELS = (90.0, 235.0)
 GREYS = {(0, 0.0): 120.0, (1, 0.0): 150.0, (0, 2.0): 165.0, (1, 2.5): 135.0, (0, 5.0): 175.0, (1, 6.0): 145.0}
 # The floor with a margin, as with_ends leaves it.
@@ -27,7 +27,7 @@ TRUE = {(1, 0): ((-1, 0), -2.0), (0, 1): ((0, -1), -2.5)}
 
 
 def cameras(count: int = 16) -> list[Camera]:
-    """In both arms, looking at where they meet and past the inner corner."""
+    """Cameras in both arms, looking at their junction and past the inner corner."""
     share = np.linspace(0, 1, count // 2)
     along_y = [(0.9 + 0.5 * np.sin(7 * s), 5.3 - 3.0 * s, 1.3 + 0.2 * np.cos(5 * s)) for s in share]
     along_x = [(4.4 - 3.0 * s, 1.2 + 0.5 * np.sin(7 * s), 1.3 + 0.2 * np.cos(5 * s)) for s in share]
@@ -37,7 +37,7 @@ def cameras(count: int = 16) -> list[Camera]:
 
 
 def seen(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) depth of the room, and the grey of what is there."""
+    """(H, W) depth of the room, and its grey value."""
     rays = camera.world_rays().reshape(-1, 3)
     depth = np.zeros(len(rays))
     for _ in range(3):  # a ray leaves one box, perhaps into the other
@@ -89,8 +89,8 @@ def test_walls_at_an_inner_corner_are_found(seed):
         assert np.linalg.norm(ends - INNER, axis=1).min() < 0.03
 
 
-def test_rays_end_at_inner_walls_and_pass_beside_them():
-    """A wall is nothing beyond its own rectangle: the line goes on through the other arm."""
+def test_rays_end_at_inner_walls_only_within_their_rectangle():
+    """The plane of an inner wall continues through the other arm of the room, where it must not end rays."""
     of = cameras()
     known = floors(of)
     ends = np.array([[-6.0, 0.0], [-2.5, HEIGHT]])
@@ -115,7 +115,7 @@ def test_rays_end_at_inner_walls_and_pass_beside_them():
     assert hidden < sum(np.count_nonzero(np.isfinite(depth)) for depth in depths)
 
 
-def test_what_is_known_behind_a_wall_refutes_it():
+def test_known_points_behind_a_wall_refute_it():
     of = cameras()
     points, normals = [], np.zeros((SIZE[1], SIZE[0], 3))
     for view, (camera, (depth, _)) in enumerate(zip(of, map(seen, of), strict=True)):
@@ -131,8 +131,8 @@ def test_what_is_known_behind_a_wall_refutes_it():
 
 
 @pytest.mark.parametrize("behind", [1.0, 1.1])
-def test_a_front_that_views_see_past_is_no_inner_wall(behind):
-    """Photographs show its edges, but in place of the wall at x = 2 what is behind it is known."""
+def test_a_front_with_known_points_behind_it_is_no_inner_wall(behind):
+    """Photographs show the edges of the wall at x = 2, but depths `behind` times as far are known there."""
     of = cameras()
     known = floors(of)
     up = np.broadcast_to([0.0, 0, 1], (SIZE[1], SIZE[0], 3))

@@ -1,4 +1,4 @@
-"""Walls that are known inexactly, in photographs with noise of a room whose floor is known."""
+"""Inaccurate walls are moved to their lines with the floor, in noisy photographs of a room with known floor."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLOOR, LEFT, RIGHT = PLANES[0], PLANES[1], PLANES[3]
 
 
 def turned(plane: np.ndarray, degrees: float, shift: float) -> np.ndarray:
-    """A wall turned about the vertical line in its middle, and shifted into the room."""
+    """Turn a wall about its central vertical line and shift it into the room."""
     middle = plane[3] * plane[:3] + (1 - np.abs(plane[:3])) * [1.5, 1.0, 0]
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     normal = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]) @ plane[:3]
@@ -32,7 +32,7 @@ def moved(planes, by_points: int = 1, of=None, known=None, **options) -> dict[in
 
 
 def off(plane: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Degrees, and the greatest distance between the corners of a wall and one of 2 by 1 m or more that is true."""
+    """Angle in degrees to the true wall, and the greatest distance of its corners from the plane."""
     corners = [true[3] * true[:3] + (1 - np.abs(true[:3])) * [x, y, z] for x in (0, 3) for y in (0, 2) for z in (0, 2)]
     angle = float(np.degrees(np.arccos(min(1.0, plane[:3] @ true[:3]))))
     return angle, float(np.abs(np.array(corners) @ plane[:3] - plane[3]).max())
@@ -40,7 +40,7 @@ def off(plane: np.ndarray, true: np.ndarray) -> tuple[float, float]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("degrees", "shift"), [(2.0, 0.03), (-2.0, -0.03), (0.0, 0.05)])
-def test_a_wall_is_set_on_the_end_of_its_floor(seed, degrees, shift):
+def test_a_wall_is_moved_to_the_end_of_its_floor(seed, degrees, shift):
     for true in (LEFT, RIGHT):
         (wall,) = moved([FLOOR, turned(true, degrees, shift)], seed=seed).values()
         angle, distance = off(wall, true)
@@ -48,47 +48,47 @@ def test_a_wall_is_set_on_the_end_of_its_floor(seed, degrees, shift):
         assert angle < 0.2 and distance < 0.005
 
 
-def test_normals_stay_on_their_side():
+def test_normals_keep_their_sign():
     (wall,) = moved([FLOOR, -turned(LEFT, 2.0, 0.03)]).values()
     assert off(-wall, LEFT)[0] < 0.2
 
 
-def test_a_wall_that_leans_stands_upright():
+def test_a_leaning_wall_is_made_upright():
     leaning = np.array([np.cos(np.radians(3)), 0, np.sin(np.radians(3)), 0.02])
     (wall,) = moved([FLOOR, leaning]).values()
     assert wall[2] == pytest.approx(0, abs=1e-9) and off(wall, LEFT)[1] < 0.004
 
 
-def test_of_a_plane_with_points_all_over_its_copy_moves_to_the_wall_close_behind():
+def test_the_duplicate_of_a_point_plane_moves_to_the_wall_close_behind():
     before = turned(LEFT, 0.0, 0.012)
     found = moved([FLOOR, before, -before], by_points=2)
     assert list(found) == [2]
     assert off(-found[2], LEFT)[1] < 0.004
 
 
-def test_what_has_points_all_over_and_stands_far_before_a_wall_stays():
-    # 1 % of the 1.6 m to the cameras is what such a plane may be off by.
+def test_a_point_plane_far_in_front_of_a_wall_stays():
+    # Such a plane may be off by 1 % of its distance to the cameras, 1.6 m.
     before = turned(LEFT, 0.0, 0.05)
     assert moved([FLOOR, before, before], by_points=2) == {}
     assert list(moved([FLOOR, before])) == [1]
 
 
-def test_a_line_before_what_has_points_all_over_is_not_that_of_the_wall():
-    """A skirting board, or a rug, ends there."""
+def test_a_line_in_front_of_a_point_plane_does_not_move_it():
+    """The line may be the end of a skirting board or a rug."""
     behind = turned(LEFT, 0.0, -0.012)
     assert moved([FLOOR, behind, behind], by_points=2) == {}
     assert list(moved([FLOOR, behind])) == [1]
 
 
-def test_a_line_farther_away_than_planes_are_off_by_is_not_theirs():
+def test_a_distant_line_does_not_move_a_wall():
     assert moved([FLOOR, turned(LEFT, 0.0, 0.14)]) == {}
 
 
-def test_no_line_shows_between_a_wall_and_a_floor_of_the_same_grey():
+def test_no_line_is_found_between_wall_and_floor_of_equal_grey():
     assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], greys=(120.0, *GREYS[1:])) == {}
 
 
-def test_what_hides_the_line_says_nothing_of_it():
+def test_a_hidden_line_moves_no_wall():
     of = cameras()
     known = floors(of)
     for camera, depth in zip(of, known, strict=True):
@@ -99,8 +99,8 @@ def test_what_hides_the_line_says_nothing_of_it():
 
 
 @pytest.mark.parametrize(("reach", "found"), [(0.08, False), (0.25, True)])
-def test_a_line_that_gaps_alone_show_says_nothing_where_all_of_others_is_seen(reach, found):
-    """What is known up to so far before a wall hides four fifths of the line at the wall, and of lines beside it."""
+def test_a_line_seen_through_gaps_counts_only_if_nearby_lines_are_hidden_too(reach, found):
+    """Known depths within `reach` of the wall hide four fifths of its line, and of other lines within `reach`."""
     of = cameras()
     known = floors(of)
     for camera, depth in zip(of, known, strict=True):
@@ -121,7 +121,7 @@ def cabinets(of) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wall_whose_foot_is_hidden_is_set_on_the_edge_at_one_that_stands(seed):
+def test_a_wall_with_hidden_foot_is_moved_to_its_edge_with_a_placed_wall(seed):
     of = cameras()
     back = turned(PLANES[2], 2.0, 0.03)
 
@@ -133,7 +133,7 @@ def test_a_wall_whose_foot_is_hidden_is_set_on_the_edge_at_one_that_stands(seed)
         assert angle < 0.3 and distance < 0.01
 
 
-def test_a_wall_whose_foot_is_hidden_stays_without_one_that_stands():
+def test_a_wall_with_hidden_foot_stays_without_a_placed_wall():
     of = cameras()
     assert moved([FLOOR, turned(PLANES[2], 2.0, 0.03)], of=of, known=cabinets(of)) == {}
 
@@ -144,19 +144,19 @@ def test_views_from_one_direction_are_not_enough():
     assert moved([FLOOR, wall], of=at_corner(spread=0.01)) == {}
 
 
-def test_photographs_have_to_be_upright():
+def test_rolled_photographs_move_no_wall():
     assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], of=at_corner(roll=True)) == {}
 
 
-def test_a_wall_at_neither_a_right_angle_to_the_floor_nor_to_one_that_stands_stays():
-    """It leads through the corner of the room, where an edge shows."""
+def test_a_wall_oblique_to_placed_walls_stays():
+    """It passes through the corner of the room, where an edge is visible."""
     of = cameras()
     across = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
     found = moved([FLOOR, turned(LEFT, -2.0, 0.02), across], of=of, known=cabinets(of))
     assert list(found) == [1]
 
 
-def test_a_line_in_the_middle_of_a_floor_is_no_wall():
+def test_a_line_in_the_middle_of_a_floor_moves_no_wall():
     of = cameras()
     maps = photographs(of)
     for found, (depth, which) in zip(maps, map(seen, of), strict=True):
@@ -167,19 +167,19 @@ def test_a_line_in_the_middle_of_a_floor_is_no_wall():
     assert on_meeting_lines(planes, 1, [replace(found, normal=up) for found in maps], floors(of)) == {}
 
 
-def test_nothing_is_set_right_by_noise():
+def test_noise_moves_no_wall():
     for seed in range(4):
         assert moved([FLOOR, turned(LEFT, 2.0, 0.03)], greys=(120.0,) * 6, seed=seed) == {}
 
 
-def test_what_is_no_wall_stays():
+def test_planes_that_are_no_walls_stay():
     slope = np.array([np.sin(np.radians(70)), 0, np.cos(np.radians(70)), 0.0])
-    inside = turned(LEFT, 0.0, 0.6)  # part of the floor is behind it
+    inside = turned(LEFT, 0.0, 0.6)  # part of the floor is behind this plane
     assert moved([FLOOR, slope, inside]) == {}
     assert moved([turned(LEFT, 2.0, 0.03)], by_points=0) == {}
 
 
-def test_a_floor_that_is_askew_has_the_direction_of_a_table_with_more_points():
+def test_a_tilted_floor_takes_the_normal_of_a_table_with_more_points():
     of = cameras()
     on_table = [np.where(np.isfinite(depth), depth * 0.7, np.nan) for depth in floors(of)]
     points = points_of(of, on_table)
@@ -195,7 +195,7 @@ def test_a_floor_that_is_askew_has_the_direction_of_a_table_with_more_points():
     assert floor[:3] == pytest.approx([0, 0, 1]) and floor[3] == pytest.approx(0, abs=0.02)
 
 
-def test_planes_are_the_same_whatever_side_their_normals_are_on():
+def test_planes_with_opposite_normals_are_the_same():
     assert is_same(LEFT, LEFT) and is_same(RIGHT, -RIGHT) and not is_same(LEFT, RIGHT)
 
 
@@ -205,14 +205,14 @@ ATTIC, ATTIC_GREYS = np.concatenate([PLANES, SLOPE[None]]), (*GREYS, 205.0)
 
 
 def leaning(degrees: float, shift: float) -> np.ndarray:
-    """The slope turned about the horizontal line in its middle, and shifted inwards."""
+    """Turn the slope about its central horizontal line and shift it inwards."""
     cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     normal = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]]) @ SLOPE[:3]
     return np.append(normal, normal @ [1.5, 1.6, 1.6] + shift)
 
 
 def in_attic(slope: np.ndarray, seed: int = 0, walls: tuple[int, ...] = (1, 3)) -> dict[int, np.ndarray]:
-    """Those of a floor, of `walls` with points along their upper ends, and of a slope that have moved."""
+    """The planes that move, of a floor, of `walls` whose upper parts are known, and of a slope."""
     known, maps = [], []
     of = [look_at(camera.center, (1.5, 1.9, 1.3), size=SIZE, focal=220.0) for camera in cameras()]
     for found in photographs(of, ATTIC_GREYS, ATTIC, seed):
@@ -225,7 +225,7 @@ def in_attic(slope: np.ndarray, seed: int = 0, walls: tuple[int, ...] = (1, 3)) 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("degrees", "shift"), [(2.0, -0.04), (-2.0, -0.04)])
-def test_a_slope_goes_through_the_lines_along_which_it_meets_walls(seed, degrees, shift):
+def test_a_slope_is_moved_to_its_meeting_lines_with_walls(seed, degrees, shift):
     found = in_attic(leaning(degrees, shift), seed)[3]
     assert np.degrees(np.arccos(found[:3] @ SLOPE[:3])) < 0.5
     ends = np.array([[x, y, 3.2 - y] for x in (0, 3) for y in (1.2, 2)])
@@ -235,8 +235,8 @@ def test_a_slope_goes_through_the_lines_along_which_it_meets_walls(seed, degrees
 
 
 @pytest.mark.parametrize("normal", [[0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-def test_what_is_level_or_upright_does_not_lean(monkeypatch, normal):
-    """Such planes are not asked for lines that others have on them, a slope is."""
+def test_level_and_upright_planes_are_not_treated_as_slopes(monkeypatch, normal):
+    """Meeting lines with walls are searched for slopes only."""
     leaning = {}
     monkeypatch.setattr(meeting_lines, "_leaning", lambda wall, *_: leaning.setdefault(tuple(wall)))
     in_attic(np.array([*normal, -3.0]))
@@ -244,15 +244,15 @@ def test_what_is_level_or_upright_does_not_lean(monkeypatch, normal):
     assert list(leaning) == [tuple(SLOPE)]
 
 
-def test_a_slope_that_has_these_lines_on_it_stays():
+def test_a_slope_that_fits_its_meeting_lines_stays():
     assert 3 not in in_attic(leaning(0.1, 0.002))
 
 
-def test_one_line_does_not_tell_where_a_slope_leans():
+def test_one_meeting_line_does_not_move_a_slope():
     assert 3 not in in_attic(leaning(2.0, -0.04), walls=(1,))
 
 
-def test_a_line_that_others_contradict_does_not_move_a_slope(monkeypatch):
+def test_an_inconsistent_meeting_line_is_ignored(monkeypatch):
     def shown(wall, base, near, edges, reach=meeting_lines.REACH):
         line = clearest_line(wall, base, near, edges, reach)
         return line if line is None or base[1] > -0.5 else line + [0, 0, 0.15]

@@ -1,5 +1,5 @@
-"""Planes of regions without texture: of a box with plain walls, whose confirmed depths are exact along its edges; and
-things that must not become planes."""
+"""Planes of textureless regions from exact depths along their edges: plain walls of a corner, and curved surfaces that
+give no plane."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from linprim_geo.stereo.planes.plain_regions import (
     plain_regions,
 )
 
-# A corner of a room: floor z = 0 and two walls x = 0 and y = 0, from the air where all are positive.
+# A corner of a room: floor z = 0 and walls x = 0 and y = 0, seen from positive coordinates.
 WALLS = np.eye(3)
 CENTERS = [(4.0, 3.0, 2.0), (3.0, 4.0, 2.2), (3.6, 3.6, 1.5), (4.4, 2.6, 1.8), (2.8, 4.4, 1.6)]
 GREYS = np.array([80, 120, 160])
@@ -29,7 +29,7 @@ def camera_at(center):
 
 
 def corner_depth(camera) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W) depth of the corner, and which wall it is."""
+    """(H, W) depth of the corner, and number of the wall."""
     rays = camera.world_rays()
     with np.errstate(divide="ignore"):
         along = np.stack([-(camera.center @ n) / (rays @ n) for n in WALLS], axis=-1)
@@ -38,7 +38,7 @@ def corner_depth(camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen(camera, depth: np.ndarray, grey: np.ndarray, number: int):
-    """The regions of a view whose edges have exact depths, and nothing else has one."""
+    """Regions of a view that has exact depths at edges and none elsewhere."""
     edge = edges_of(grey, 1.0)
     return plain_regions(number, camera, grey, edge, np.where(edge, depth, np.nan).astype(np.float32), edge)
 
@@ -50,7 +50,7 @@ def corner_from(centers):
     for number, camera in enumerate(cameras):
         depth, wall = corner_depth(camera)
         grey = GREYS[wall]
-        # Marks on the walls, as pictures and sockets are, in the planes of these.
+        # Marks in the planes of the walls, like pictures and sockets.
         rng = np.random.default_rng(0)
         for row, column in zip(rng.integers(5, 110, 60), rng.integers(5, 150, 60), strict=True):
             grey[row : row + 3, column : column + 3] += 60
@@ -65,25 +65,25 @@ def corner():
 
 
 def close_together(share: float) -> list[np.ndarray]:
-    """CENTERS at so much of their distances from their middle."""
+    """CENTERS with distances from their mean scaled by `share`."""
     middle = np.mean(CENTERS, axis=0)
     return [middle + share * (center - middle) for center in np.array(CENTERS)]
 
 
 @pytest.mark.parametrize("share", [1.0, 0.3])
-def test_the_walls_of_a_corner_are_found_from_their_edges(share):
-    """From directions that differ by 30 degrees, or by 9: all views find the same normals."""
+def test_walls_of_a_corner_are_found_from_depths_along_edges(share):
+    """Viewing directions differ by 30 degrees or by 9; the normals of all views agree."""
     cameras, _, regions = corner_from(close_together(share))
     planes = common_planes(cameras, [region for own in regions for region in own])
     assert len(planes) >= 3
     for wall in WALLS:
-        # Exact depths: what is left is the mixture of two walls within a pixel of their edge.
+        # Depths are exact; the error comes from pixels that mix two walls at their edge.
         near = np.abs(planes[:, :3] @ wall) > np.cos(np.radians(1))
         assert near.any() and np.abs(planes[near, 3]).min() < 0.02
 
 
-def test_far_points_that_are_not_sure_are_on_no_plane():
-    """A floor that goes on to the horizon has some on it by chance."""
+def test_far_unsure_points_are_on_no_plane():
+    """Points near the horizon of a floor would lie on it by chance."""
     rng = np.random.default_rng(0)
     rays = np.column_stack([rng.uniform(-1, 1, 100), rng.uniform(0.001, 0.5, 100), np.ones(100)])
     floor, sure = np.array([[0.0, 1.0, 0.0]]), np.arange(100) < 50
@@ -96,7 +96,7 @@ def test_far_points_that_are_not_sure_are_on_no_plane():
 
 
 def round_depth(camera, center: np.ndarray, radius: float, axis: np.ndarray) -> np.ndarray:
-    """(H, W) depth of the nearest point of a cylinder, infinite beside it; a ball without an axis."""
+    """(H, W) depth of a cylinder, infinite beside it. A zero axis gives a ball."""
     rays = camera.world_rays()
     start = camera.center - center
     across, begin = rays - (rays @ axis)[..., None] * axis, start - (start @ axis) * axis
@@ -107,7 +107,7 @@ def round_depth(camera, center: np.ndarray, radius: float, axis: np.ndarray) -> 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 0.3, 0.2, 0.15])
 @pytest.mark.parametrize("axis", [(0, 0, 0), (0, 0, 1)], ids=["ball", "column"])
-def test_what_is_round_becomes_no_plane(axis, share):
+def test_balls_and_columns_give_no_plane(axis, share):
     center, cameras = np.array([0.8, 0.8, 0.8]), [camera_at(c) for c in close_together(share)]
     regions = []
     for number, camera in enumerate(cameras):
@@ -119,7 +119,7 @@ def test_what_is_round_becomes_no_plane(axis, share):
 
 
 def front_of_a_pillar(noise: float):
-    """Cameras, and regions of the front of a pillar, 0.6 wide and 1.5 high, that looks at them from 4 away."""
+    """Cameras, and regions of the front of a pillar, 0.6 wide and 1.5 high, at a distance of 4."""
     normal, middle = np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.array([0.8, 0.8, 0.8])
     cameras, regions = [camera_at(center) for center in CENTERS], []
     for number, camera in enumerate(cameras):
@@ -132,15 +132,15 @@ def front_of_a_pillar(noise: float):
     return cameras, regions
 
 
-def test_a_narrow_plane_is_as_certain_as_its_points_scatter():
-    """0.3 % of the depth tell where the front of a pillar is, and 1 % do not."""
+def test_a_narrow_plane_is_found_if_its_points_scatter_little():
+    """The front of a pillar is found with noise of 0.3 % of the depth, but not with 1 %."""
     (plane,) = common_planes(*front_of_a_pillar(0.003))
     assert abs(plane[:2].sum()) > np.sqrt(2) * np.cos(np.radians(1)) and abs(plane[3]) == pytest.approx(1.131, rel=0.01)
     assert not len(common_planes(*front_of_a_pillar(0.01)))
 
 
-def test_points_that_are_chosen_by_being_near_do_not_tell_how_they_scatter():
-    """A quarter of the points along the edges of the front are before it, as those of things before a wall are."""
+def test_a_narrow_plane_with_outliers_is_not_found():
+    """A quarter of the points along the edges lies in front of the plane, as those of objects before a wall do."""
     cameras, regions = front_of_a_pillar(0.003)
     mixed = []
     for region in regions:
@@ -149,8 +149,8 @@ def test_points_that_are_chosen_by_being_near_do_not_tell_how_they_scatter():
     assert len(common_planes(cameras, regions)) and not len(common_planes(cameras, mixed))
 
 
-def test_a_wall_that_is_slightly_bent_becomes_no_plane():
-    """A plain cylinder of radius 12, seen from inside, between an edge at the floor and one at a height of 1.6."""
+def test_a_slightly_curved_wall_gives_no_plane():
+    """A cylinder of radius 12, seen from inside, with edges at the floor and at a height of 1.6."""
     center, axis = np.array([-9.0, -9.0, 0.0]), np.array([0.0, 0.0, 1.0])
     cameras, regions = [camera_at(c) for c in CENTERS], []
     for number, camera in enumerate(cameras):
@@ -166,11 +166,11 @@ def test_a_wall_that_is_slightly_bent_becomes_no_plane():
     assert all(regions) and not len(common_planes(cameras, [region for own in regions for region in own]))
 
 
-def test_a_plain_region_reaches_to_where_pixels_are_half_of_it():
+def test_regions_grow_over_edges_to_the_mean_grey_of_both_sides():
     grey = np.full((40, 60), 200.0)
     grey[:, 30:] = 100
     grey[:, 29], grey[:, 30] = 190, 150  # blur
-    grey[:5, 40:] = 200  # as bright, but nowhere near
+    grey[:5, 40:] = 200  # as bright, but not connected
     edge = np.zeros(grey.shape, bool)
     edge[:, 28:32] = True
     region = np.zeros(grey.shape, bool)

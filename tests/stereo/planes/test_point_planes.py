@@ -1,4 +1,4 @@
-"""Planes of large flat surfaces, and what lies on them: of exact depths with noise, and things that must stay."""
+"""Planes of large flat surfaces from noisy depths, the pixels that lie on them, and those that must not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def map_of(camera, depth: np.ndarray, normal: np.ndarray, rng: np.random.Generat
 
 
 def corner(centers=CENTERS, seed: int = 0) -> tuple[list[DepthMap], list[np.ndarray]]:
-    """Maps of a wall y = 0 and a floor z = -0.6 before it, and the true depths."""
+    """Maps of a wall y = 0 and a floor z = -0.6 in front of it, and the true depths."""
     rng, maps, depths = np.random.default_rng(seed), [], []
     for center in centers:
         camera = look_at(center, target=(0.0, 0.0, 0.0), size=(96, 72), focal=80.0)
@@ -59,8 +59,8 @@ def test_a_wall_and_a_floor_are_found(seed):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_plane_does_not_lie_across_two_surfaces(seed):
-    """A picture on a wall, and a board 4 cm before the wall beside it: one plane holds both within a share of 0.01 of
-    their distance, a degree and a half askew."""
+    """A picture on a wall, and beside it a board 4 cm in front of the wall. A plane at 1.5 degrees would contain both
+    within 1 % of their distance."""
     rng, maps = np.random.default_rng(seed), []
     board = np.array([0.0, 1.0, 0.0, 0.04])
     for center in CENTERS:
@@ -83,7 +83,7 @@ def test_a_plane_does_not_lie_across_two_surfaces(seed):
     assert np.abs(offsets[[0, -1]] - [0.0, 0.04]).max() < 3e-3
 
 
-def test_one_or_two_views_are_not_enough():
+def test_two_views_or_no_depths_give_no_plane():
     for views in (1, 2):
         maps, _ = corner(CENTERS[:views])
         assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
@@ -91,7 +91,7 @@ def test_one_or_two_views_are_not_enough():
     assert planes_of_points(maps, nothing).shape == (0, 4)
 
 
-def test_a_ball_has_no_plane():
+def test_a_ball_gives_no_plane():
     rng, maps = np.random.default_rng(0), []
     for center in CENTERS:
         camera = look_at(center, target=(0.0, 0.0, 0.0), size=(96, 72), focal=80.0)
@@ -104,7 +104,7 @@ def test_a_ball_has_no_plane():
     assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
 
 
-def test_depths_that_stereo_cannot_tell_from_a_plane_are_on_it():
+def test_depths_within_their_deviation_are_moved_to_the_plane():
     maps, depths = corner()
     planes = np.array([WALL, FLOOR])
     for found, depth in zip(maps, depths, strict=True):
@@ -114,8 +114,8 @@ def test_depths_that_stereo_cannot_tell_from_a_plane_are_on_it():
         assert np.median(np.abs(flat / depth - 1)[inside]) < 1e-6 < np.median(np.abs(found.depth / depth - 1))
 
 
-def test_relief_stays():
-    """A board of 16 by 16 pixels that stands 0.6 % of its depth before the wall: within the tolerance of a plane."""
+def test_relief_above_the_deviation_is_kept():
+    """A board of 16x16 pixels, 0.6 % of its depth in front of the wall, which is within the tolerance of the plane."""
     maps, depths = corner()
     found, depth = maps[2], depths[2].copy()
     depth[12:28, 40:56] *= 1 - 2 * NOISE
@@ -125,7 +125,7 @@ def test_relief_stays():
     assert np.isfinite(flat[5:20, 5:30]).mean() > 0.9
 
 
-def test_what_nothing_confirms_is_on_a_plane_where_most_depths_are():
+def test_unconfirmed_pixels_take_a_plane_that_most_depths_around_lie_on():
     maps, depths = corner()
     found, depth = maps[2], depths[2]
     camera, rng = found.camera, np.random.default_rng(2)

@@ -1,4 +1,4 @@
-"""Plain walls by what is known along their edges: of a room whose walls have one grey each, and of a house."""
+"""Planes laid over plain regions by depths along their edges: a room with plain walls, a board, and houses."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from linprim_geo.stereo.edges import edges_of
 from linprim_geo.stereo.planes.plain_regions import in_camera, in_world, regions_of_views
 from linprim_geo.stereo.planes.region_planes import beside_edges, region_plane_depths
 
-# Photographs that show one colour of everything, and others of everything.
+# Comparisons of colours that always find the same colour, or always different ones.
 ALIKE, OTHERS = (SimpleNamespace(differ=lambda *_, answer=answer: answer) for answer in (False, True))
 
 
 def laid_planes(of, regions, planes, known) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    """Of every view: the depth that planes give, where known ones are moved to it, and where the plane stands; stereo
-    is sure of all that it confirms."""
+    """For every view: the depth by planes, where known depths are moved to it, and where the plane replaces them. All
+    confirmed depths are sure."""
     found = region_plane_depths(of, regions, planes, known, known, ALIKE)
     return [one.depth for one in found], [one.moved for one in found], [one.stands for one in found]
 
 
 @pytest.fixture(scope="module")
 def room():
-    """Cameras in a room, true depths, which wall is seen, the regions of all views with exact depths along edges alone,
-    and these depths."""
+    """Cameras in a room, true depths, numbers of walls, regions of all views, and known depths, which are exact and
+    exist along edges only."""
     of = cameras()
     maps = photographs(of)
     depths, walls = zip(*(seen(camera) for camera in of), strict=True)
@@ -40,7 +40,7 @@ def room():
 
 def test_walls_lie_on_their_planes(room):
     of, depths, walls, regions, known = room
-    # Others that go through the edges of some walls, and one that is 2 cm behind a wall.
+    # Wrong planes through edges between walls, and one 2 cm behind a wall.
     behind = [1, 0, 0, -0.02]
     across = np.array([[np.sqrt(0.5), np.sqrt(0.5), 0, 0], [0.0, np.sqrt(0.5), np.sqrt(0.5), 0], behind])
     found, moved, _ = laid_planes(of, regions, np.concatenate([PLANES, across]), known)
@@ -53,8 +53,8 @@ def test_walls_lie_on_their_planes(room):
     assert (np.abs(error) < 1e-4).mean() > 0.98
 
 
-def test_of_two_planes_with_as_many_points_the_one_that_is_nearer_to_them_is_taken(room):
-    """A wall, and one that is 1 cm before it, which is within the error of depths."""
+def test_of_planes_with_equal_points_the_closer_one_is_taken(room):
+    """A second plane is 1 cm in front of the wall, which is within the error of depths."""
     of, depths, walls, regions, known = room
     before = PLANES[1] + [0, 0, 0, 0.01]
     found, *_ = laid_planes(of, regions, np.array([before, PLANES[1]]), known)
@@ -63,7 +63,7 @@ def test_of_two_planes_with_as_many_points_the_one_that_is_nearer_to_them_is_tak
     assert np.isfinite(error).mean() > 0.8 and np.nanmedian(np.abs(error)) < 1e-4
 
 
-def test_pixels_have_the_numbers_of_their_planes(room):
+def test_plane_numbers_agree_with_walls(room):
     of, depths, walls, regions, known = room
     for laid, wall in zip(region_plane_depths(of, regions, PLANES, known, known, ALIKE), walls, strict=True):
         is_laid = np.isfinite(laid.depth)
@@ -73,8 +73,8 @@ def test_pixels_have_the_numbers_of_their_planes(room):
         assert np.isnan(without.depth[wall == 1]).all() and not (without.moved | without.stands)[wall == 1].any()
 
 
-def test_a_wall_ends_where_its_points_do(room):
-    """Of all planes that of one wall alone: other walls have points on it where they meet it, and lie beside it."""
+def test_a_plane_is_not_laid_beyond_its_points(room):
+    """Only the plane of one wall is given. Adjacent walls have points on it where they meet it."""
     of, depths, walls, regions, known = room
     found, *_ = laid_planes(of, regions, PLANES[[1]], known)
     on_it = np.concatenate([np.isfinite(depth)[wall == 1] for depth, wall in zip(found, walls, strict=True)])
@@ -82,13 +82,13 @@ def test_a_wall_ends_where_its_points_do(room):
     assert on_it.mean() > 0.8 and beside.mean() < 0.01
 
 
-def test_without_planes_nothing_is_known(room):
+def test_no_planes_give_no_depths(room):
     of, _, _, regions, known = room
     assert not any(np.isfinite(depth).any() for depth in laid_planes(of, regions, np.zeros((0, 4)), known)[0])
 
 
-def test_points_on_one_line_make_no_wall(room):
-    """A plane through the line along which the floor meets a wall has points there alone."""
+def test_a_plane_with_points_on_one_line_is_not_laid(room):
+    """A plane through the line between floor and wall has points on this line only."""
     of, _, _, regions, known = room
     leaning = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]])
     depths, *_ = laid_planes(of, regions, leaning, known)
@@ -96,7 +96,7 @@ def test_points_on_one_line_make_no_wall(room):
 
 
 @pytest.mark.parametrize(("share", "laid"), [(0.45, True), (0.55, False)])
-def test_what_stereo_is_sure_of_within_a_region_refuses_a_plane(room, share, laid):
+def test_sure_depths_off_a_plane_refuse_it(room, share, laid):
     of, depths, walls, regions, known = room
     inside = []
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
@@ -108,8 +108,8 @@ def test_what_stereo_is_sure_of_within_a_region_refuses_a_plane(room, share, lai
 
 
 @pytest.mark.parametrize(("off", "are_moved"), [(0.0, True), (0.002, True), (0.003, False)])
-def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, are_moved):
-    """Beside edges a fifth is off by more."""
+def test_sure_depths_are_moved_to_a_plane_if_their_median_is_near(room, off, are_moved):
+    """A fifth of the pixels is off by more, and is moved or not as the others are."""
     of, depths, walls, regions, known = room
     inside, beside = [], []
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
@@ -124,8 +124,8 @@ def test_sure_depths_on_a_wall_are_moved_to_it_if_most_are_not_off(room, off, ar
 
 
 @pytest.mark.parametrize(("most", "are_moved"), [(0.006, True), (0.0098, False)])
-def test_sure_depths_that_go_through_a_wall_are_not_moved_to_it(room, most, are_moved):
-    """As evenly before it as behind it, by so much at most: of those within 1 % a half is within 0.5 % then."""
+def test_sure_depths_that_cross_a_plane_are_not_moved(room, most, are_moved):
+    """Depths deviate from the wall evenly between -`most` and `most`."""
     of, depths, walls, regions, known = room
     inside = []
     for depth, wall, edges in zip(depths, walls, known, strict=True):
@@ -139,8 +139,8 @@ def test_sure_depths_that_go_through_a_wall_are_not_moved_to_it(room, most, are_
     assert len(moved) > 100_000 and moved.mean() == are_moved
 
 
-def from_middle(region: np.ndarray) -> tuple[np.ndarray, float]:
-    """(H, W) pixels from the middle of the largest circle in a region (H, W), and its radius."""
+def from_largest_circle(region: np.ndarray) -> tuple[np.ndarray, float]:
+    """(H, W) distance in pixels from the centre of the largest circle in a region (H, W), and its radius."""
     inner = distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
     middle = np.unravel_index(np.argmax(inner), inner.shape)
     places = zip(np.indices(region.shape), middle, strict=True)
@@ -148,12 +148,12 @@ def from_middle(region: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 @pytest.mark.parametrize(("share", "laid"), [(0.45, True), (0.55, False)])
-def test_a_thing_that_no_edge_parts_from_a_wall_is_not_laid_on_it(room, share, laid):
-    """Stereo confirms so much of a disc before the wall, and is not sure of it, and of nothing else inside."""
+def test_an_object_of_confirmed_depths_inside_a_region_is_not_laid_on_the_wall(room, share, laid):
+    """A `share` of a disc in front of the wall is confirmed without being sure, and nothing else inside the region."""
     of, depths, walls, regions, known = room
     confirmed, discs = [], []
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
-        away, inner = from_middle(wall == 1)
+        away, inner = from_largest_circle(wall == 1)
         thing = (away < 50) & (inner > 70)
         seen_of_it = thing & (np.random.default_rng(number).uniform(size=depth.shape) < share)
         confirmed.append(np.where(seen_of_it, 0.9 * depth, edges))
@@ -165,12 +165,12 @@ def test_a_thing_that_no_edge_parts_from_a_wall_is_not_laid_on_it(room, share, l
 
 
 @pytest.mark.parametrize(("share", "are_doubted"), [(0.45, False), (0.95, True)])
-def test_what_nothing_shows_in_a_wall_that_stereo_knows_is_doubted(room, share, are_doubted):
-    """Of the wall it knows so much, and of a disc nothing."""
+def test_unknown_areas_of_a_known_wall_are_doubted(room, share, are_doubted):
+    """Stereo is sure of a `share` of the wall, but has no depths in a disc."""
     of, depths, walls, regions, known = room
     inside, discs = [], []
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
-        away, inner = from_middle(wall == 1)
+        away, inner = from_largest_circle(wall == 1)
         sure = (wall == 1) & (np.random.default_rng(number).uniform(size=depth.shape) < share)
         inside.append(np.where((away < 50) & np.isnan(edges), np.nan, np.where(sure, depth, edges)))
         discs.append((away < 15) & (inner > 70))
@@ -183,8 +183,8 @@ def test_what_nothing_shows_in_a_wall_that_stereo_knows_is_doubted(room, share, 
 
 
 def with_bands(depths, walls, known, off: float, reach: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """(H, W) depths that stereo knows, and where they are those of an edge that go on into wall 1, which are off by a
-    factor. Of the rest of the wall it knows half."""
+    """Known depths (H, W), and bands beside the edges of wall 1 (H, W), where depths are wrong by a factor. Half of the
+    remaining wall is known."""
     inside, beside = [], []
     for number, (depth, wall, edges) in enumerate(zip(depths, walls, known, strict=True)):
         plain = (wall == 1) & np.isnan(edges)
@@ -195,8 +195,8 @@ def with_bands(depths, walls, known, off: float, reach: int) -> tuple[list[np.nd
 
 
 @pytest.mark.parametrize("off", [0.95, 1.05])
-def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off):
-    """Before it or behind it, for as far as stereo's windows reach. Of the rest of the wall half is known."""
+def test_wrong_depths_beside_edges_are_replaced_by_the_wall(room, off):
+    """Depths within reach of stereo windows are before or behind the wall. Half of the remaining wall is known."""
     of, depths, walls, regions, known = room
     inside, beside = with_bands(depths, walls, known, off, 8)
     found, moved, stands = laid_planes(of, regions, PLANES[[1]], inside)
@@ -206,8 +206,8 @@ def test_an_edges_depth_that_goes_on_into_a_wall_gives_way_to_the_wall(room, off
     assert np.concatenate([own[which] for own, which in zip(moved, wide, strict=True)]).all()
 
 
-def test_what_an_edge_gives_to_a_wall_beside_it_does_not_refuse_the_walls_plane(room):
-    """Where nothing else of the wall is known: before it by 10 %."""
+def test_depths_beside_edges_do_not_refuse_a_plane(room):
+    """The bands beside edges are 10 % too near, and nothing else of the wall is known."""
     of, depths, walls, regions, known = room
     inside, beside = with_bands(depths, walls, known, 0.9, 8)
     inside = [
@@ -218,10 +218,10 @@ def test_what_an_edge_gives_to_a_wall_beside_it_does_not_refuse_the_walls_plane(
     assert on_it.mean() > 0.8
 
 
-def test_what_may_be_an_edges_depth_lies_beside_edges_of_wide_regions():
+def test_beside_edges_marks_bands_in_wide_regions_only():
     camera, grey = cameras(1)[0], np.full((300, 400), 120.0)
     grey[:, 200:] = 160
-    grey[:, 200::24] = 60  # what is between these lines is narrow
+    grey[:, 200::24] = 60  # regions between these lines are narrow
     (found,) = noisy_maps([camera], [grey], 0)
     edge = edges_of(found.grey, NOISE**2)
     (regions,) = regions_of_views([found], [np.where(edge, 2.0, np.nan)])
@@ -230,8 +230,8 @@ def test_what_may_be_an_edges_depth_lies_beside_edges_of_wide_regions():
 
 
 @pytest.mark.parametrize("seen_through", [False, True])
-def test_a_plane_that_others_see_through_is_refused(room, seen_through):
-    """30 cm before a wall, along whose edges some views have points on it. The others know the wall or nothing."""
+def test_a_plane_that_other_views_see_through_is_refused(room, seen_through):
+    """Every second view has edge points on a plane 30 cm in front of a wall. The others know the wall or nothing."""
     of, depths, walls, _, _ = room
     before = PLANES[1] + [0, 0, 0, 0.3]
     maps, known = photographs(of), []
@@ -248,8 +248,8 @@ def test_a_plane_that_others_see_through_is_refused(room, seen_through):
     assert laid < 0.02 if seen_through else laid > 0.2
 
 
-def test_between_edges_that_are_near_each_other_known_depths_stay(room):
-    """Nothing tells there whether they are an edge's or a thing's before the wall: between lines 30 pixels apart."""
+def test_known_depths_in_narrow_regions_stay(room):
+    """In regions between lines 30 pixels apart depths may be those of an edge or of an object in front of the wall."""
     of, depths, walls, _, _ = room
     lines = np.zeros(depths[0].shape, bool)
     lines[::30], lines[:, ::30] = True, True
@@ -264,14 +264,14 @@ def test_between_edges_that_are_near_each_other_known_depths_stay(room):
     assert not any((own | stand)[which].any() for own, stand, which in zip(moved, stands, laid, strict=True))
 
 
-def test_a_thing_that_no_edge_parts_from_a_wall_stays_before_it(room):
-    """Stereo knows all of the wall, and 60 by 60 cm of a thing before it that are as plain."""
+def test_an_object_of_sure_depths_inside_a_region_stays_in_front_of_the_wall(room):
+    """Stereo knows all of the wall, and a plain object of 60 by 60 cm in front of it."""
     of, depths, walls, regions, known = room
     inside, thing = [], []
     for camera, depth, wall, edges in zip(of, depths, walls, known, strict=True):
         _, y, z = np.moveaxis(camera.center + (camera.ray_grid() * depth[..., None]) @ camera.rotation, -1, 0)
         thing.append((wall == 1) & (np.abs(y - 1) < 0.3) & (np.abs(z - 0.9) < 0.3) & np.isnan(edges))
-        if thing[-1].sum() < 1000:  # cut off by the border, a strip that is no wider than a band along an edge
+        if thing[-1].sum() < 1000:  # cut off by the image border to a strip no wider than the bands along edges
             thing[-1][:] = False
         inside.append(np.where(wall == 1, np.where(thing[-1], 0.9, 1) * depth, edges))
     _, moved, stands = laid_planes(of, regions, PLANES[[1]], inside)
@@ -282,9 +282,9 @@ def test_a_thing_that_no_edge_parts_from_a_wall_stays_before_it(room):
     assert not any((own | stand)[which].any() for own, stand, which in zip(moved, stands, thing, strict=True))
 
 
-def test_of_planes_through_the_line_of_two_walls_the_one_that_holds_the_region_is_taken(room):
-    """Stereo rounds the line in which a wall meets the floor, so that a plane halfway between them has many points; of
-    the wall's other edges it knows half."""
+def test_the_plane_that_covers_more_of_the_region_is_taken(room):
+    """Stereo rounds the line between wall and floor, so that a plane halfway between them has many points. Half of the
+    other edges of the wall are known."""
     of, depths, walls, _, known = room
     between = np.array([[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.05 * np.sqrt(0.5)]])
     rounded = []
@@ -302,9 +302,8 @@ def test_of_planes_through_the_line_of_two_walls_the_one_that_holds_the_region_i
     assert len(error) > 200_000 and (np.abs(error) < 1e-4).mean() > 0.98
 
 
-def test_a_thing_does_not_lie_on_the_wall_behind():
-    """A plain board before a wall with marks, which has points all around the board. Stereo knows both up to where they
-    end; the board is known along its upper edge alone."""
+def test_a_board_is_not_laid_on_the_wall_behind_it():
+    """The wall has marks and known points all around the plain board, which is known along its upper edge only."""
     camera = look_at((4.0, 3.0, 2.0), target=(0.8, 0.8, 0.8), size=(160, 120), focal=110.0)
     grey, board = np.full((120, 160), 120, np.uint8), np.zeros((120, 160), bool)
     grey[::6, ::6] = 90
@@ -320,8 +319,8 @@ def test_a_thing_does_not_lie_on_the_wall_behind():
 
 
 def between_houses(edge_depth: float) -> np.ndarray:
-    """(H, W) depth by the plane of the fronts of two houses in a plain band between them, before a horizon whose edges
-    stereo holds to be so far away, without being sure of it."""
+    """(H, W) depth by the plane of two fronts in the plain band between the houses. Edges of the horizon behind it have
+    the unsure depth `edge_depth`."""
     camera = look_at((4.0, 3.0, 2.0), target=(0.8, 0.8, 0.8), size=(160, 120), focal=110.0)
     grey = np.full((120, 160), 120, np.uint8)
     houses = np.zeros(grey.shape, bool)
@@ -340,14 +339,14 @@ def between_houses(edge_depth: float) -> np.ndarray:
     return between[44:76, 70:100]
 
 
-def test_a_plane_does_not_go_on_between_houses_before_what_is_far():
+def test_a_plane_is_not_laid_between_houses_before_a_far_horizon():
     assert np.allclose(between_houses(np.nan), 3.0), "nothing contradicts it"
     assert np.allclose(between_houses(9.0), 3.0), "depths that are not sure do not"
     assert np.isnan(between_houses(300.0)).all()
 
 
 def with_lines(walls, apart: int) -> list[np.ndarray]:
-    """(H, W) greys of walls with dark lines so many pixels apart."""
+    """(H, W) grey values of walls with dark lines `apart` pixels from each other."""
     lines = np.zeros(walls[0].shape, bool)
     lines[:, ::apart] = True
     return [np.array(GREYS)[wall] - 60.0 * lines for wall in walls]
@@ -356,8 +355,8 @@ def with_lines(walls, apart: int) -> list[np.ndarray]:
 @pytest.mark.parametrize(
     ("apart", "share", "laid", "is_refused"), [(30, 0.0, False, True), (30, 0.9, True, False), (400, 0.0, True, False)]
 )
-def test_between_edges_a_plane_on_which_photographs_show_other_colours_is_refused(room, apart, share, laid, is_refused):
-    """But not in what is wide, nor in a region of which stereo knows most."""
+def test_a_plane_with_inconsistent_colours_is_refused_in_narrow_unknown_regions(room, apart, share, laid, is_refused):
+    """The plane is laid in wide regions, and in regions whose depths are mostly known."""
     of, depths, walls, _, _ = room
     maps = noisy_maps(of, with_lines(walls, apart), 0)
     known = []
@@ -382,8 +381,8 @@ def test_between_edges_a_plane_on_which_photographs_show_other_colours_is_refuse
 
 
 @pytest.mark.parametrize(("share", "laid"), [(0.4, True), (0.2, False)])
-def test_things_before_a_plane_may_show_other_colours(room, share, laid):
-    """A wall behind lines of which so many are before it."""
+def test_inconsistent_colours_are_accepted_behind_enough_nearer_edges(room, share, laid):
+    """A wall behind lines, a `share` of whose points is in front of it."""
     of, depths, walls, _, _ = room
     maps, known = noisy_maps(of, with_lines(walls, 30), 0), []
     for number, (found, depth) in enumerate(zip(maps, depths, strict=True)):

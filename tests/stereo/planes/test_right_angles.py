@@ -1,4 +1,4 @@
-"""Planes that are nearly at right angles become so, and no others."""
+"""Planes that are nearly at right angles are made so, others are not."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ def angle(one, other) -> float:
 FLOOR = np.array([0.0, 0, 1, 0])
 
 
-def test_walls_turn_to_a_floor_that_stays_and_to_each_other_by_what_is_known_of_them():
+def test_walls_turn_to_right_angles_weighted_by_their_information():
     one, other = turned([1, 0, 0], 3, [0, 0.6, 0.8]), turned([0, 1, 0], 2, [0, 0, -1], 2.0)
     planes = np.array([FLOOR, one, other])
     found = orthogonalised(planes, [None, np.eye(3), 100 * np.eye(3)], moves)
     assert (found[0] == FLOOR).all()
     for i, j in ((0, 1), (0, 2), (1, 2)):
         assert angle(found[i], found[j]) == pytest.approx(90, abs=0.02)
-    # What more is known of turns less.
+    # The plane with more information turns less.
     assert angle(found[2], other) < 0.1 < 3 < angle(found[1], one) < 6
     assert found[1:, 3] == pytest.approx([1, 2], abs=0.01)
     np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1)
 
 
-def test_other_angles_stay():
+def test_planes_far_from_right_angles_stay():
     for leaning in (turned([1, 0, 0], 8, [0, 1, 0]), turned([0, 1, 0], 45, [1, 0, 0]), turned([0, 0, 1], 3, [0, 1, 0])):
         planes = np.array([FLOOR, leaning])
         assert (orthogonalised(planes, [None, np.eye(3)], moves) == planes).all()
@@ -48,23 +48,23 @@ def test_other_angles_stay():
     assert orthogonalised(np.zeros((0, 4)), [], moves).shape == (0, 4)
 
 
-def test_angles_that_exclude_each_other_leave_a_plane_as_it_is():
+def test_contradicting_right_angles_leave_a_plane_unchanged():
     ramp = turned([0, 0, 1], 8, [0, 1, 0])
     between, clear = turned([1, 0, 0], 4, [0, 1, 0]), turned([0, 1, 0], 2, [1, 0, 0])
     found = orthogonalised(np.array([FLOOR, ramp, between, clear]), [None, None, np.eye(3), np.eye(3)], moves)
     assert (found[:3] == [FLOOR, ramp, between]).all()
-    # It is at right angles to the floor and the ramp at once.
+    # This plane can be at right angles to the floor and the ramp at once.
     assert angle(found[3], FLOOR) == pytest.approx(90, abs=0.02) and angle(found[3], clear) > 1.5
 
 
-def test_of_planes_that_stay_and_are_nearly_parallel_the_first_counts():
+def test_the_first_of_nearly_parallel_fixed_planes_counts():
     table, wall = turned([0, 0, 1], 2, [0, 1, 0]), turned([1, 0, 0], 3, [0, 1, 0])
     for stay in ([FLOOR, table], [table, FLOOR]):
         found = orthogonalised(np.array([*stay, wall]), [None, None, np.eye(3)], moves)
         assert (found[:2] == stay).all() and angle(found[2], stay[0]) == pytest.approx(90, abs=0.02)
 
 
-def test_the_frame_of_a_room_is_that_of_most_planes():
+def test_the_frame_of_a_room_follows_most_planes():
     room = [turned([0, 0, 1], 0.3, [1, 0, 0]), turned([1, 0, 0], 0.2, [0, 0, 1]), turned([0, -1, 0], 0.3, [0, 0, 1])]
     room += [turned([0, 0, -1], 0.2, [0, 1, 0]), turned([1, 0, 0], 0.3, [0, 1, 0])]
     furniture = [turned([0.6, 0.8, 0], 2, [1, 0, 0]), turned([-0.8, 0.6, 0], 1, [0, 0, 1])]
@@ -79,8 +79,8 @@ def test_the_frame_of_a_room_is_that_of_most_planes():
 
 
 @pytest.mark.parametrize("degrees", [3, 10])
-def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
-    """A chair's back leans and a box stands askew: they come first, and a wall is nearly at right angles to both."""
+def test_walls_turn_along_the_frame_despite_oblique_furniture(degrees):
+    """The back of a chair and a box come first in the list. A wall is nearly at right angles to both."""
     chair, box = turned([1, 0, 0], 9, [0, 1, 0]), turned([1, 0, 0], 4.4, [0, 0, 1])
     stay = [chair, box, FLOOR, turned([1, 0, 0], 0, [0, 0, 1], 3.0), turned([0, 1, 0], 0, [0, 0, 1], 4.0)]
     wall, slope = turned([0, 1, 0], degrees, [0.6, 0, 0.8], 2.0), turned([0, 1, 0], 45, [1, 0, 0], 2.0)
@@ -88,5 +88,5 @@ def test_walls_turn_along_the_frame_whatever_else_stands_about(degrees):
     found = orthogonalised(np.array([*stay, wall, slope]), [*[None] * 5, np.eye(3), np.eye(3)], moves, frame)
     assert (found[:5] == stay).all()
     assert angle(found[5], stay[4]) < 0.15 and found[5, 3] == pytest.approx(2, abs=0.05)
-    # The slope is at right angles to one of the walls alone.
+    # The slope is at a right angle to one of the walls only.
     assert angle(found[6], slope) < 0.01

@@ -1,4 +1,4 @@
-"""Walls of one grey each, over a floor whose depth is known, in photographs with noise."""
+"""Walls of one grey value each above a floor of known depth, in photographs with noise."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def at_corner_walls(of: list[Camera], *others: EnclosingPlane, floor: EnclosingP
 
 
 def corner_walls(maps, known, backgrounds, enclosing, points) -> list[EnclosingPlane]:
-    """Walls that are none of the enclosing planes."""
+    """Walls that are found in addition to the enclosing planes."""
     return with_corner_walls(maps, known, backgrounds, enclosing, points)[len(enclosing) :]
 
 
@@ -53,7 +53,7 @@ def found(greys=GREYS, planes: np.ndarray = PLANES, enclosing=(FLOOR,), backgrou
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_walls_without_texture_are_found_by_the_edges_between_them(seed):
+def test_textureless_walls_are_found_by_the_edges_between_them(seed):
     walls = found(seed=seed)
 
     assert len(walls) == 4
@@ -62,13 +62,13 @@ def test_walls_without_texture_are_found_by_the_edges_between_them(seed):
         assert true[:3] @ wall.normal > np.cos(np.radians(0.5))
         middle = wall.at(wall.own.mean(0))
         assert abs(true[:3] @ middle - true[3]) < 0.01
-        # From corner to corner, and no higher than the ceiling by more than one of the heights that are tried.
+        # From corner to corner, and at most one step of the tried heights above the ceiling.
         length = 2 if abs(wall.normal[0]) > 0.5 else 3
         assert np.diff(wall.own[:, 0]) == pytest.approx(length, abs=0.03)
         assert wall.own[0, 1] == pytest.approx(0, abs=1e-9) and 0.5 < wall.own[1, 1] < 2.2
 
 
-def test_rays_that_meet_a_wall_end_there():
+def test_rays_end_at_corner_walls_with_2_percent_error():
     of = cameras()
     known = floors(of)
     walls = found()
@@ -90,12 +90,12 @@ def test_rays_that_meet_a_wall_end_there():
 
 
 @pytest.mark.parametrize("floor", [90.0, 230])
-def test_walls_of_the_same_grey_show_no_edge(floor):
+def test_walls_of_equal_grey_are_not_found(floor):
     assert found(greys=(floor, 140, 140, 140, 140, 140)) == []
 
 
 def test_no_walls_rise_from_a_table_in_a_far_room():
-    # The room is ten times as large, and its edges far from the ends of what is known: a table of 3 by 2 m.
+    # The room is ten times as large, so that its edges are far from the ends of the known table of 3 by 2 m.
     far = PLANES.copy()
     far[:, 3] = [-0.8, -14, -11, -17, -13, -20]
     of = cameras()
@@ -108,14 +108,14 @@ def test_no_walls_rise_from_a_table_in_a_far_room():
 
 
 def is_on(camera: Camera) -> np.ndarray:
-    """(H, W) bool, which rays meet the table."""
+    """(H, W) bool, rays that meet the table."""
     inverse = camera.ray_grid() @ in_camera(camera, PLANES[:1])[0]
     with np.errstate(divide="ignore"):
         place = camera.center + camera.world_rays() / inverse[..., None]
     return (inverse > 0) & (place[..., :2] > 0).all(-1) & (place[..., :2] < [3, 2]).all(-1)
 
 
-def test_a_wall_that_is_known_is_not_found_again():
+def test_a_known_wall_is_not_found_again():
     ends = np.array([[0.0, 0.0], [2.0, 1.0]])
     known = EnclosingPlane(np.array([1.0, 0, 0]), 0.0, np.eye(3)[1:], ends, ends)
 
@@ -125,7 +125,7 @@ def test_a_wall_that_is_known_is_not_found_again():
 
 
 @pytest.mark.parametrize("goes_on", [False, True])
-def test_a_wall_that_is_known_in_part_goes_on_to_its_edges_if_its_floor_does_not(goes_on):
+def test_a_partly_known_wall_extends_to_its_edges_unless_the_floor_continues(goes_on):
     of = cameras()
     floor = floors(of)
     points = points_of(of, floor)
@@ -146,8 +146,8 @@ def test_a_wall_that_is_known_in_part_goes_on_to_its_edges_if_its_floor_does_not
         assert (same.whole == same.own).all()
 
 
-def test_a_plane_that_is_askew_does_not_go_on():
-    """It faces nearly as the wall at x = 0 does, and holds the middle of that, but not its corners."""
+def test_an_oblique_plane_is_not_extended():
+    """It is turned by 10 degrees against the wall at x = 0 and contains its centre, but not its corners."""
     of = cameras()
     turn = np.radians(10.0)
     normal, middle = np.array([np.cos(turn), np.sin(turn), 0]), np.array([0.0, 1.0, 0.5])
@@ -161,7 +161,7 @@ def test_a_plane_that_is_askew_does_not_go_on():
     assert (same.own == ends).all()
 
 
-def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
+def test_a_wall_is_found_by_its_edge_with_a_known_wall():
     # The walls at x = 3, y = 0 and y = 2 have the same grey: their edges do not show.
     greys = (90.0, 120, 150, 150, 150, 240)
     ends = np.array([[0.0, 0.0], [3.0, 1.0]])
@@ -173,7 +173,7 @@ def test_a_wall_meets_one_that_is_known_at_the_only_edge_that_shows():
     assert directions(walls) == [(1, 0, 0)]
 
 
-def test_a_wall_in_place_of_which_views_see_a_background_is_none():
+def test_no_wall_is_found_where_views_see_background():
     of = cameras()
     sky = [seen(camera)[1] == 1 for camera in of]
 
@@ -182,7 +182,7 @@ def test_a_wall_in_place_of_which_views_see_a_background_is_none():
     assert len(walls) == 3 and all(wall.normal[0] < 0.5 for wall in walls)
 
 
-def test_a_floor_that_goes_on_behind_a_wall_has_none_there():
+def test_no_wall_is_found_where_the_floor_continues_behind_it():
     of = cameras()
     known = floors(of)
     points = points_of(of, known)
@@ -193,7 +193,7 @@ def test_a_floor_that_goes_on_behind_a_wall_has_none_there():
     assert directions(walls) == [(-1, 0, 0), (0, -1, 0), (0, 1, 0)]
 
 
-def test_walls_are_no_floors():
+def test_no_walls_rise_from_a_wall():
     side = EnclosingPlane(np.array([1.0, 0, 0]), 0.0, np.eye(3)[1:], *2 * [np.array([[0.0, 0.0], [2.0, 2.0]])])
 
     assert found(enclosing=(side,)) == []
@@ -212,13 +212,13 @@ def hidden_feet(of: list[Camera]) -> list[np.ndarray]:
     return known
 
 
-def test_one_edge_alone_is_no_wall_but_one_at_a_known_wall():
+def test_one_edge_gives_a_wall_only_at_a_known_wall():
     of = at_corner()
     assert at_corner_walls(of, known=hidden_feet(of)) == []
     assert directions(at_corner_walls(of, KNOWN_WALL, known=hidden_feet(of))) == [(1, 0, 0)]
 
 
-def test_one_edge_and_the_line_on_the_floor_are_a_wall():
+def test_one_edge_and_the_line_on_the_floor_give_a_wall():
     assert directions(at_corner_walls(at_corner())) == [(0, 1, 0), (1, 0, 0)]
 
 
@@ -227,7 +227,7 @@ def closing(x: float) -> EnclosingPlane:
     return EnclosingPlane(np.array([1.0, 0, 0]), x, np.eye(3)[1:], ends, ends, closes=True)
 
 
-def test_a_plane_that_closes_the_scene_is_shifted_to_its_edge():
+def test_a_closing_plane_is_shifted_to_its_edge():
     of = cameras()
     edges = EdgeImages(photographs(of), floors(of))
     for off in (0.02, 0.08):
@@ -239,8 +239,8 @@ def test_a_plane_that_closes_the_scene_is_shifted_to_its_edge():
 
 
 @pytest.mark.parametrize("order", [(0.09, -0.03, None), (None, -0.03, 0.09)])
-def test_of_several_edges_the_nearest_counts(monkeypatch, order):
-    """Where walls end the closing plane is; one of them has another edge near its upper end."""
+def test_the_nearest_of_several_edges_counts(monkeypatch, order):
+    """The closing plane is where walls end. One of the walls has another edge nearby."""
     lines = iter(None if x is None else np.array([[x, 0.0, 0.0], [x, 1.0, 0.0]]) for x in order)
     monkeypatch.setattr(room_corners, "clearest_line", lambda *_: next(lines))
     edges = EdgeImages(photographs(cameras()), floors(cameras()))
@@ -249,7 +249,7 @@ def test_of_several_edges_the_nearest_counts(monkeypatch, order):
 
 
 @pytest.mark.parametrize(("x", "stays"), [(0.02, True), (0.3, False)])
-def test_a_plane_that_closes_the_scene_without_an_edge_is_left_out(x, stays):
+def test_a_closing_plane_without_an_edge_is_removed(x, stays):
     of = cameras()
     known = floors(of)
     enclosing = [FLOOR, closing(x)]
@@ -258,15 +258,15 @@ def test_a_plane_that_closes_the_scene_without_an_edge_is_left_out(x, stays):
     assert not any(plane.offset == x for plane in planes)
 
 
-def test_photographs_have_to_be_upright():
+def test_rolled_photographs_give_no_wall():
     assert at_corner_walls(at_corner(roll=True), KNOWN_WALL) == []
 
 
-def test_edges_have_to_be_seen_from_directions_that_differ():
+def test_edges_seen_from_one_direction_give_no_wall():
     assert at_corner_walls(at_corner(spread=0.01), KNOWN_WALL) == []
 
 
-def test_a_wall_from_one_edge_has_the_direction_in_which_the_floor_ends():
+def test_a_wall_from_one_edge_is_aligned_with_the_end_of_the_floor():
     turned = np.radians(2.0)
     axes = np.array([[np.cos(turned), np.sin(turned), 0], [-np.sin(turned), np.cos(turned), 0]])
     floor = EnclosingPlane(FLOOR.normal, 0.0, axes, FLOOR.own, FLOOR.own)
@@ -276,7 +276,7 @@ def test_a_wall_from_one_edge_has_the_direction_in_which_the_floor_ends():
     assert wall.normal @ [1, 0, 0] > np.cos(np.radians(0.7))
 
 
-def test_edges_reach_up_as_far_as_is_asked():
+def test_corners_reach_the_required_height():
     of = cameras()
     edges = EdgeImages(photographs(of), floors(of))
     near = FLOOR.own[0]
@@ -286,7 +286,7 @@ def test_edges_reach_up_as_far_as_is_asked():
 
 
 class FaintAbove(EdgeImages):
-    """Whose lines show an edge less clearly if they reach above 1.2 m."""
+    """Edge images whose lines are fainter above 1.2 m."""
 
     def shares(self, starts, directions, along, parts):
         result = super().shares(starts, directions, along, parts)
@@ -295,15 +295,15 @@ class FaintAbove(EdgeImages):
         return result
 
 
-def test_an_edge_goes_on_as_far_as_its_next_part_shows_it():
+def test_an_edge_continues_while_its_next_part_is_visible():
     of = cameras()
     corner = find_corner(FLOOR, FLOOR.own[0], 0.5, FaintAbove(photographs(of), floors(of)))
     assert corner is not None
-    # They show no more than 1.6 m of it; heights are 3.1 m / 16 apart.
+    # Photographs show at most 1.6 m of the edge. Heights are tried in steps of 3.1 m / 16.
     assert 1.3 < corner.height < 1.6
 
 
-def test_a_floor_that_is_known_along_a_quarter_of_a_wall_says_nothing_of_it():
+def test_a_floor_known_along_a_quarter_of_a_wall_gives_no_wall():
     of = cameras()
     known = floors(of)
     points = points_of(of, known)
@@ -315,7 +315,7 @@ def test_a_floor_that_is_known_along_a_quarter_of_a_wall_says_nothing_of_it():
     assert directions(walls) == [(-1, 0, 0), (1, 0, 0)]
 
 
-def test_a_wall_with_known_points_behind_it_is_none():
+def test_no_wall_is_found_in_front_of_known_points():
     of = cameras()
     known = floors(of)
     points = points_of(of, known)
@@ -331,7 +331,7 @@ def each_20th(points: SurfacePoints) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.7, -0.7])
-def test_lines_along_an_edge_are_strong_and_hidden_ones_are_not_seen(slope):
+def test_strength_of_lines_along_across_and_hidden_edges(slope):
     camera = look_at((0.0, -2.0, 0.0), size=SIZE, focal=300.0)
     x, y = np.meshgrid(np.arange(SIZE[0]) + 0.5 - camera.cx, np.arange(SIZE[1]) + 0.5 - camera.cy)
     grey = np.where(x + slope * y > 0, 180, 100).astype(np.uint8)
@@ -350,7 +350,7 @@ def test_lines_along_an_edge_are_strong_and_hidden_ones_are_not_seen(slope):
     assert np.isnan(hidden).all()
 
 
-def test_shares_that_are_even_are_not_surprising():
+def test_probabilities_of_uniform_shares_are_uniform():
     rng = np.random.default_rng(0)
     shares = rng.uniform(size=(9, 20_000, 1))
     shares[rng.uniform(size=shares.shape) < 0.3] = np.nan

@@ -1,4 +1,4 @@
-"""Depths in the air beside a board before a wall, which other views see through."""
+"""Removal of depths that other views see through, beside a board in front of a wall."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from helpers.captures import look_at
 from linprim_geo.stereo.planes.plain_regions import in_camera
 from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
 
-# A wall at y = 0 and a board of 40 by 40 cm that is 50 cm before it, seen from y < 0.
+# A wall at y = 0 and a board of 40 by 40 cm, 50 cm in front of it, seen from y < 0.
 WALL, BOARD, HALF = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0, -0.5]), 0.2
 CAMERAS = [look_at((x, -2.5, 0.1), (0.0, 0.0, 0.0), size=(120, 90), focal=150.0) for x in np.linspace(-1, 1, 9)]
 
@@ -19,7 +19,7 @@ def depth_on(camera, plane: np.ndarray) -> np.ndarray:
 
 
 def is_board(camera, half: float = HALF) -> np.ndarray:
-    """(H, W) bool which rays meet a board of twice this width and height."""
+    """(H, W) bool, rays that meet a board whose sides are 2 `half`."""
     points = camera.center + (camera.ray_grid() * depth_on(camera, BOARD)[..., None]) @ camera.rotation
     return (np.abs(points[..., [0, 2]]) < half).all(-1)
 
@@ -29,7 +29,7 @@ def seen(camera, half: float = HALF) -> np.ndarray:
 
 
 def without_air(known: list[np.ndarray]) -> list[np.ndarray]:
-    """(H, W) what is known of every view but for what is in the air."""
+    """(H, W) known depths of every view without those that are seen through."""
     left = [depth.copy() for depth in known]
     FreeSpaceTest(CAMERAS, known).clear(left, [np.ones(depth.shape, bool) for depth in known])
     return left
@@ -37,21 +37,21 @@ def without_air(known: list[np.ndarray]) -> list[np.ndarray]:
 
 @pytest.fixture
 def flap() -> tuple[np.ndarray, np.ndarray]:
-    """What the first view sees with the board 10 cm too wide each way, and (H, W) bool where it is too wide."""
+    """Depths of the first view with a board 10 cm too wide on each side, and (H, W) bool where it is too wide."""
     return seen(CAMERAS[0], HALF + 0.1), is_board(CAMERAS[0], HALF + 0.1) & ~is_board(CAMERAS[0])
 
 
-def test_a_flap_beside_a_board_goes_and_nothing_else(flap):
+def test_only_wrong_depths_beside_the_board_are_removed(flap):
     depth, beside = flap
     known = [depth] + [seen(camera) for camera in CAMERAS[1:]]
     left = without_air(known)
     gone = ~np.isfinite(left[0])
-    # But for three pixels around the board, which may be of either side.
+    # Three pixels around the board may be kept or removed.
     assert not gone[~beside].any() and gone[beside & ~is_board(CAMERAS[0], HALF + 0.04)].all()
     assert all(np.array_equal(one, other) for one, other in zip(left[1:], known[1:], strict=True))
 
 
-def test_what_is_not_asked_for_stays(flap):
+def test_pixels_outside_the_mask_stay(flap):
     depth, beside = flap
     known, left = [depth] + [seen(camera) for camera in CAMERAS[1:]], depth.copy()
     half = np.zeros(depth.shape, bool)
@@ -61,7 +61,7 @@ def test_what_is_not_asked_for_stays(flap):
 
 
 @pytest.mark.parametrize(("witnesses", "goes"), [(0, False), (1, False), (2, True), (8, True)])
-def test_a_single_view_does_not_speak_against_a_depth_nor_do_those_that_know_nothing(flap, witnesses, goes):
+def test_two_views_must_see_through_a_depth(flap, witnesses, goes):
     depth, beside = flap
     nothing = np.full(depth.shape, np.nan)
     known = [depth] + [seen(camera) if k < witnesses else nothing for k, camera in enumerate(CAMERAS[1:])]
@@ -70,7 +70,7 @@ def test_a_single_view_does_not_speak_against_a_depth_nor_do_those_that_know_not
 
 
 @pytest.mark.parametrize(("having", "against", "goes"), [(7, 1, False), (7, 2, True), (9, 2, False), (9, 3, True)])
-def test_more_than_a_quarter_of_those_that_have_the_depth_speak_against_it(having, against, goes):
+def test_views_that_see_through_must_exceed_a_quarter_of_those_that_agree(having, against, goes):
     camera = CAMERAS[4]
     depths = [depth_on(camera, BOARD)] * having + [depth_on(camera, WALL)] * against
     points = camera.center + (camera.ray_grid() * depths[0][..., None]) @ camera.rotation
@@ -78,8 +78,8 @@ def test_more_than_a_quarter_of_those_that_have_the_depth_speak_against_it(havin
     assert (air == goes).all()
 
 
-def test_a_bar_of_a_pixel_or_two_stays():
-    """Views that know it see the wall beside it, and a point on it may lie half a pixel beside it there."""
+def test_a_bar_of_one_to_two_pixels_stays():
+    """Projected to another view, a point of the bar may be off by half a pixel and fall on the wall beside it."""
     bars = []
     for camera in CAMERAS:
         points = camera.center + (camera.ray_grid() * depth_on(camera, BOARD)[..., None]) @ camera.rotation
@@ -90,7 +90,7 @@ def test_a_bar_of_a_pixel_or_two_stays():
     assert 1 <= min(widths) and max(widths) <= 2
 
 
-def test_of_no_depths_nothing_is_left():
+def test_unknown_depths_stay_unknown():
     nothing = [np.full((90, 120), np.nan)] * len(CAMERAS)
     assert all(np.isnan(depth).all() for depth in without_air(nothing))
     assert FreeSpaceTest(CAMERAS, nothing).see_through(np.zeros((0, 3))).shape == (0,)

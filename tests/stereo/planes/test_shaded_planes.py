@@ -1,5 +1,4 @@
-"""Planes of walls without texture, by how light falls off along them: of analytic photographs with noise, and things
-that must not become planes."""
+"""Planes of textureless walls by their shading, in analytic photographs with noise, and surfaces that get no plane."""
 
 from __future__ import annotations
 
@@ -25,7 +24,7 @@ NO_PLANES = np.zeros((0, 4))
 
 
 def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=None):
-    """From rendered depths that are a tenth too near and tilted, as those of plain walls are."""
+    """Planes from rendered depths that are 6 to 14 % too near and tilted, as is typical of plain walls."""
     width = depths[0].shape[1]
     rendered = [(depth * np.linspace(0.86, 0.94, width)).astype(np.float32) for depth in depths]
     confirmed = confirmed or [np.full(depth.shape, np.nan, np.float32) for depth in depths]
@@ -33,27 +32,27 @@ def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=N
 
 
 def in_the_middle(depth) -> np.ndarray:
-    """A depth map, NaN but for a ninth."""
+    """A depth map that is NaN except in its central ninth."""
     known = np.full_like(depth, np.nan)
     known[60:120, 80:160] = depth[60:120, 80:160]
     return known
 
 
 def laid(found: ShadedPlanes, along_edges: int | None = None) -> list[np.ndarray]:
-    """Depth maps of all views, of which points along edges say nothing or that all of them lies on one plane."""
+    """Depth maps of all views. Points along edges are unknown, or all lie on plane `along_edges`."""
     number = -1 if along_edges is None else along_edges
     return found.depth_maps(found.areas([np.full((c.height, c.width), number) for c in found.cameras]))
 
 
 def errors(found: ShadedPlanes, depths) -> tuple[float, np.ndarray]:
-    """The share of pixels that have depths, and how far these are off."""
+    """Share of pixels with depths, and relative errors of these."""
     own = laid(found)
     off = np.concatenate([np.abs(one / depth - 1)[np.isfinite(one)] for one, depth in zip(own, depths, strict=True)])
     return float(np.mean([np.isfinite(one).mean() for one in own])), off
 
 
 @pytest.mark.parametrize("seed", [0, 100, 200])
-def test_a_lit_wall_without_texture_is_where_it_is(seed):
+def test_a_textureless_lit_wall_is_found_within_half_a_percent(seed):
     maps, depths = photographs(lambda points, view: light(points), seed=seed)
     found = planes_of(maps, depths)
     assert len(found.planes) == 1
@@ -65,28 +64,28 @@ def test_a_lit_wall_without_texture_is_where_it_is(seed):
 
 
 @pytest.mark.parametrize("seed", [0, 100, 200])
-def test_a_floor_makes_a_wall_upright_unless_photographs_say_that_it_leans(seed):
+def test_a_wall_is_made_upright_by_a_level_floor_only(seed):
     maps, depths = photographs(lambda points, view: light(points), seed=seed, noise=3.0)
     lean = np.radians(4)
     floors = {"level": [0.0, 0.0, 1.0, -0.9], "leaning": [0.0, np.sin(lean), np.cos(lean), -0.9]}
     planes = {name: planes_of(maps, depths, np.array([floor])).planes for name, floor in floors.items()}
     alone = planes_of(maps, depths).planes[-1]
-    # Upright to the last digits; what is left is the turn about the vertical, as without a floor.
+    # The wall is upright up to rounding; its turn about the vertical remains as without a floor.
     upright = planes["level"][-1]
     assert abs(upright[2]) < 1e-4 < abs(alone[2]) and abs(upright[0]) < 2 * abs(alone[0]) + 1e-3
-    # By 4 degrees the shading of the wall would be off by more than noise is.
+    # A wall turned by 4 degrees would not fit its shading within the noise.
     np.testing.assert_allclose(planes["leaning"][-1], alone, atol=1e-6)
 
 
 def room(degrees: float) -> np.ndarray:
-    """(2, 4) a floor and a side wall that points give; with the wall they make a room whose floor leans by so much."""
+    """(2, 4) point planes of a side wall and of a floor that leans by `degrees`."""
     angle = np.radians(degrees)
     return np.array([[0.0, np.sin(angle), np.cos(angle), -0.9], [1.0, 0.0, 0.0, -1.5]])
 
 
 @pytest.mark.parametrize("seed", [0, 100, 200])
-def test_a_wall_is_along_the_frame_of_its_room_unless_photographs_say_otherwise(seed):
-    """Corners that are 4 % darker, which shading takes for a turned wall, do not say so; light alone does."""
+def test_a_wall_turns_along_the_frame_unless_shading_contradicts(seed):
+    """Vignetting of 4 %, which makes shading turn the wall, is no contradiction; shading without it is."""
     row, column = np.mgrid[-1:1:180j, -1:1:240j]
     darker = 1 - 0.02 * (row**2 + column**2)
     maps, depths = photographs(lambda points, view: darker * light(points), seed=seed, noise=4.0)
@@ -98,8 +97,8 @@ def test_a_wall_is_along_the_frame_of_its_room_unless_photographs_say_otherwise(
 
 
 @pytest.mark.parametrize(("degrees", "stays"), [(0.8, True), (2.0, False)])
-def test_a_plane_with_points_that_is_askew_leaves_plain_regions_to_the_wall(degrees, stays):
-    """Points on what hangs on a wall give a plane that is not along the frame; edges give it again."""
+def test_an_oblique_point_plane_leaves_plain_regions_to_the_wall(degrees, stays):
+    """Points on pictures of a wall give a plane that is not along the frame, and edges give the same plane."""
     maps, depths = photographs(lambda points, view: light(points))
     by_points = np.array([*room(0), tilted(degrees) + [0, 0, 0, 0.01]])
     found = planes_of(maps, depths, by_points, by_edges=by_points[2:])
@@ -110,8 +109,8 @@ def test_a_plane_with_points_that_is_askew_leaves_plain_regions_to_the_wall(degr
         assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
-def test_a_plane_of_edges_along_the_frame_stays_beside_the_one_that_light_makes_of_it():
-    """Edges of a cupboard before the wall have given it: its place is theirs, and where the wall is the light says."""
+def test_a_plane_of_edges_along_the_frame_stays_beside_that_of_shading():
+    """The plane of edges is that of a cupboard in front of the wall. Shading gives that of the wall."""
     maps, depths = photographs(lambda points, view: light(points))
     cupboard = WALL + [0, 0, 0, 0.1]
     found = planes_of(maps, depths, room(0), by_edges=cupboard[None])
@@ -121,12 +120,12 @@ def test_a_plane_of_edges_along_the_frame_stays_beside_the_one_that_light_makes_
 
 
 def tilted(degrees: float) -> np.ndarray:
-    """The wall, leaning to its left by so much."""
+    """The wall, turned about the vertical by `degrees`."""
     angle = np.radians(degrees)
     return np.array([np.sin(angle), np.cos(angle), 0.0, 0.0])
 
 
-def test_a_wall_that_edges_give_twice_is_one_plane():
+def test_duplicate_planes_of_edges_are_merged():
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths, by_edges=np.array([tilted(-0.3), tilted(0.3)]))
     assert len(found.planes) == 1
@@ -134,8 +133,8 @@ def test_a_wall_that_edges_give_twice_is_one_plane():
     assert share > 0.7 and np.quantile(off, 0.95) < 0.005
 
 
-def test_planes_that_edges_tell_apart_stay_two_where_faint_light_does_not():
-    """A wall and one 4 % of the depth behind it, by light that deviates by 13 grey values."""
+def test_distinct_planes_of_edges_stay_apart_in_faint_light():
+    """A wall and a plane 4 % of the depth behind it, in light that varies by 13 grey values."""
     maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
     for apart, count in ((0.02, 1), (0.08, 2)):
         found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, apart]]))
@@ -143,8 +142,8 @@ def test_planes_that_edges_tell_apart_stay_two_where_faint_light_does_not():
     assert np.abs(found.planes[:, 3] - [0, -0.08]).max() < 0.005
 
 
-def test_of_copies_the_plane_that_edges_give_is_kept(monkeypatch):
-    """Not that of shading, although this one carries as many regions."""
+def test_of_duplicates_the_plane_of_edges_is_kept(monkeypatch):
+    """A plane of shading that fits as many regions is dropped."""
     maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
     monkeypatch.setattr(ShadedPlanes, "_common", lambda self, fitted: np.array([WALL - [0, 0, 0, 0.06], WALL]))
     monkeypatch.setattr(ConstrainedPlanes, "by_depths", lambda self, planes, *_: planes)
@@ -153,17 +152,17 @@ def test_of_copies_the_plane_that_edges_give_is_kept(monkeypatch):
     np.testing.assert_array_equal(found.planes, [WALL - [0, 0, 0, 0.06]])
 
 
-def test_a_plane_that_edges_give_is_the_one_that_points_give():
+def test_a_plane_of_edges_near_a_point_plane_is_replaced_by_it():
     maps, depths = photographs(lambda points, view: light(points))
     by_points = np.array([tilted(0.1)])
     found = planes_of(maps, depths, by_points, by_edges=-np.array([tilted(-0.4)]))
     np.testing.assert_array_equal(found.planes, [by_points[0], -by_points[0]])
-    # Two that differ by more than depths are certain stay two.
+    # Planes that differ by more than the uncertainty of depths stay separate.
     found = planes_of(maps, depths, by_points, by_edges=np.array([tilted(0) + [0, 0, 0, 0.1]]))
     assert (found.planes[1] != by_points[0]).any()
 
 
-def test_exposures_that_differ_change_nothing():
+def test_a_wall_is_found_under_different_exposures():
     rng = np.random.default_rng(5)
     gains, offsets = rng.uniform(0.85, 1.15, len(CENTERS)), rng.uniform(-8, 8, len(CENTERS))
     maps, depths = photographs(lambda points, view: gains[view] * light(points) + offsets[view])
@@ -172,8 +171,8 @@ def test_exposures_that_differ_change_nothing():
 
 
 @pytest.mark.parametrize("corners", [0.85, 0.7])
-def test_corners_that_are_darker_change_nothing(corners):
-    """The wall's ends are painted with a pattern that stereo confirms."""
+def test_a_wall_is_found_under_vignetting(corners):
+    """The ends of the wall have a texture with confirmed depths, which vignetting is estimated from."""
     pattern = gaussian_filter(np.random.default_rng(1).normal(size=(300, 300)), 3)[..., None]
     law = np.array([np.log(corners), 0.0])
 
@@ -203,21 +202,21 @@ def test_larger_photographs_are_halved(monkeypatch):
     assert share > 0.5 and np.quantile(off, 0.95) < 0.01
 
 
-def test_a_bent_wall_gets_no_plane():
-    # It comes forward by 4 % of its depth; by 1 % it is within the tolerance of a plane.
+def test_a_curved_wall_gets_no_plane():
+    # The bulge is 4 % of the depth; one of 1 % is within the tolerance of a plane.
     maps, depths = photographs(lambda points, view: light(points), bulge=0.08)
     assert errors(planes_of(maps, depths), depths)[0] < 0.05
     maps, depths = photographs(lambda points, view: light(points), bulge=0.02)
     assert np.quantile(errors(planes_of(maps, depths), depths)[1], 0.95) < 0.02
 
 
-def test_a_wall_in_even_light_gets_no_plane():
+def test_a_wall_in_uniform_light_gets_no_plane():
     maps, depths = photographs(lambda points, view: np.full(points.shape[:-1], 140.0))
     assert errors(planes_of(maps, depths), depths)[0] == 0
 
 
 def sky(clouds: float = 0.0):
-    """Maps and depths that are no depths: grey values depend on the direction alone."""
+    """Maps whose grey values depend on the direction only, and meaningless depths."""
     maps, depths = [], []
     for view, center in enumerate(CENTERS):
         camera = camera_at(center)
@@ -229,7 +228,7 @@ def sky(clouds: float = 0.0):
     return maps, depths
 
 
-def test_a_plane_of_edges_does_not_reach_into_the_sky():
+def test_sky_is_background_and_walls_are_not():
     maps, depths = sky()
     found = planes_of(maps, depths, by_edges=WALL[None])
     assert np.mean([found.is_background(view).mean() for view in range(len(maps))]) > 0.8
@@ -241,7 +240,7 @@ def test_a_plane_of_edges_does_not_reach_into_the_sky():
     assert any(found.shown) and not any(found.is_background(view).any() for view in range(len(maps)))
 
 
-def test_shading_tells_a_wall_from_what_is_far(monkeypatch):
+def test_shading_distinguishes_a_wall_from_background(monkeypatch):
     maps, depths = photographs(lambda points, view: light(points))
     found, everywhere = planes_of(maps, depths, by_edges=WALL[None]), np.ones(depths[0].shape, bool)
     assert np.mean([found.is_wall(view, everywhere).mean() for view in range(len(maps))]) > 0.8
@@ -254,8 +253,8 @@ def test_shading_tells_a_wall_from_what_is_far(monkeypatch):
 
 
 @pytest.mark.parametrize(("left", "is_wall"), [(0.14, False), (0.16, True)])
-def test_a_background_that_carries_shading_as_well_as_a_plane_is_no_wall(monkeypatch, left, is_wall):
-    """Of clouds planes leave less by chance: there are several, and one background."""
+def test_a_region_that_background_explains_nearly_as_well_is_no_wall(monkeypatch, left, is_wall):
+    """Several planes are tried and one background, so that a plane fits clouds better by chance."""
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths, by_edges=WALL[None])
     monkeypatch.setattr(found, "_fits", lambda region: [SimpleNamespace(left_share=0.1)])
@@ -264,7 +263,7 @@ def test_a_background_that_carries_shading_as_well_as_a_plane_is_no_wall(monkeyp
 
 
 def above_a_house(maps, depths):
-    """Maps whose lowest rows show a house with texture, of which stereo is sure."""
+    """Maps whose lowest rows show a textured house with sure depths."""
     result = []
     for found, depth in zip(maps, depths, strict=True):
         points = found.camera.center + found.camera.world_rays() * depth[..., None]
@@ -276,12 +275,12 @@ def above_a_house(maps, depths):
 
 
 def unrelated():
-    """Maps whose shading has nothing to do with each other's, and depths."""
+    """Maps with unrelated shading, and depths."""
     fields = np.random.default_rng(0).normal(0, 1, (len(CENTERS), 180, 240))
     return photographs(lambda points, view: 120 + 400 * gaussian_filter(fields[view], 14))
 
 
-def test_a_sky_is_told_from_a_wall_before_anything_is_rendered(monkeypatch):
+def test_sky_is_detected_without_rendered_depths(monkeypatch):
     above, before_wall = (
         above_a_house(*sky(clouds=100.0)),
         above_a_house(*photographs(lambda points, view: light(points))),
@@ -303,7 +302,7 @@ def test_a_sky_gets_no_plane():
     assert np.isnan(own).mean() > 0.95
 
 
-def test_stereo_that_is_sure_of_something_else_refuses_a_plane():
+def test_sure_stereo_depths_refuse_a_plane():
     maps, depths = photographs(lambda points, view: light(points))
     confirmed = [np.full(depth.shape, np.nan, np.float32) for depth in depths]
     for own, depth in zip(confirmed, depths, strict=True):
@@ -311,7 +310,7 @@ def test_stereo_that_is_sure_of_something_else_refuses_a_plane():
     assert errors(planes_of(maps, depths, confirmed=confirmed), depths)[0] == 0
 
 
-def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
+def test_a_known_plane_that_fits_the_shading_is_taken():
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(
         maps, depths, np.array([WALL, [0.0, 1.0, 0.0, 0.2]]), confirmed=[in_the_middle(d) for d in depths]
@@ -322,9 +321,9 @@ def test_a_known_plane_is_taken_where_it_carries_the_shading_as_well():
 
 
 @pytest.mark.parametrize("others, kept", [((1,), False), ((1, 8), True), ((0, 1, 2), False), ((0, 1, 2, 3), True)])
-def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kept):
-    """A floor goes on behind walls: two views alone may suppose it there, or some side by side. Neighbours see the
-    wall's middle from directions 9 degrees apart."""
+def test_a_plane_needs_support_from_enough_views_and_directions(monkeypatch, others, kept):
+    """Support by two views, or by views from similar directions, is not enough. Neighbouring views see the centre of
+    the wall from directions 9 degrees apart."""
     monkeypatch.setattr(plain_regions, "VIEW_ANGLE", np.radians(22))
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths)
@@ -336,8 +335,8 @@ def test_a_plane_that_too_few_views_know_gives_no_depth(monkeypatch, others, kep
 
 
 @pytest.mark.parametrize("others, kept", [(LEAST_VIEWS - 2, False), (LEAST_VIEWS - 1, True)])
-def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(others, kept):
-    """That their regions suppose it, too, is not enough: a floor may carry their shading as well as this one's."""
+def test_a_point_plane_gives_depth_where_other_views_confirm_it(others, kept):
+    """Regions of other views that have the same plane by shading do not count as confirmation."""
     maps, depths = photographs(lambda points, view: light(points))
     confirmed = [np.full_like(depth, np.nan) for depth in depths]
     confirmed[1 : 1 + others] = [in_the_middle(depth) for depth in depths[1 : 1 + others]]
@@ -346,14 +345,14 @@ def test_a_plane_with_points_all_over_gives_a_depth_where_others_confirm_it(othe
 
 
 @pytest.mark.parametrize("others", [False, True])
-def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_it(monkeypatch, others):
-    """A plane 2 % behind a wall leaves 1.1 to 1.5 times as much of its faint light."""
+def test_the_plane_of_edge_points_is_taken_if_other_views_support_it(monkeypatch, others):
+    """A plane 2 % behind the wall leaves residuals 1.1 to 1.5 times as large in faint light."""
     maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
     found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
     monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
 
     def supporting_views(_, view, supposed, __):
-        """All know the wall, and the plane behind it or not."""
+        """All views support the wall, and the plane behind it if `others`."""
         behind = [np.nanmedian(depth / depths[view]) > 1.01 for depth in supposed]
         return [np.arange(9) if others or not is_behind else np.zeros(0, int) for is_behind in behind]
 
@@ -363,8 +362,8 @@ def test_the_plane_that_points_along_edges_tell_is_taken_where_other_views_know_
 
 
 @pytest.mark.parametrize(("told_of", "times"), [((), 1), ((3, 4), 2)])
-def test_what_no_other_view_knows_supports_none(monkeypatch, told_of, times):
-    """Edges tell two views of a plane 2 % behind the wall, which no view knows: these suppose the wall after all."""
+def test_planes_without_support_do_not_support_others(monkeypatch, told_of, times):
+    """Edge points of two views choose an unsupported plane 2 % behind the wall. They fall back to the wall."""
     maps, depths = photographs(lambda points, view: 60 + 0.3 * light(points))
     found = planes_of(maps, depths, by_edges=np.array([WALL, WALL - [0, 0, 0, 0.08]]))
     monkeypatch.setattr(found, "planes", np.array([WALL, WALL - [0, 0, 0, 0.04]]))
@@ -383,7 +382,7 @@ def test_what_no_other_view_knows_supports_none(monkeypatch, told_of, times):
 
 
 def edge_points(depths, noise: float = 0.004, seed: int = 0):
-    """Confirmed depths of the wall where a floor and another wall would meet it: along two sides of the pictures."""
+    """Confirmed depths of the wall along two image borders, where a floor and another wall would meet it."""
     rng, confirmed = np.random.default_rng(seed), []
     for depth in depths:
         own = np.full(depth.shape, np.nan, np.float32)
@@ -394,8 +393,8 @@ def edge_points(depths, noise: float = 0.004, seed: int = 0):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_confirmed_depths_along_the_edges_hold_a_plane(seed):
-    """Of photographs whose corners are 4 % darker, as lenses make them, which shading takes for a turned wall."""
+def test_confirmed_depths_along_edges_reduce_the_error_by_vignetting(seed):
+    """Vignetting of 4 % makes shading turn the wall."""
     row, column = np.mgrid[-1:1:180j, -1:1:240j]
     darker = 1 - 0.02 * (row**2 + column**2)
     maps, depths = photographs(lambda points, view: darker * light(points), seed=100 * seed, noise=4.0)
@@ -404,8 +403,8 @@ def test_confirmed_depths_along_the_edges_hold_a_plane(seed):
     assert len(held) and np.quantile(held, 0.9) < 0.75 * np.quantile(free, 0.9)
 
 
-def test_a_plane_of_edges_before_the_wall_goes_back_to_it():
-    """As that of the back edges of a shelf which stands 2 % before a wall."""
+def test_shading_moves_a_plane_of_edges_to_the_wall():
+    """The plane is 2 % in front of the wall, like that of the back edges of a shelf."""
     maps, depths = photographs(lambda points, view: light(points))
     before = np.array([0.0, 1.0, 0.0, 0.04])
     found = planes_of(maps, depths, by_edges=before[None])
@@ -415,19 +414,17 @@ def test_a_plane_of_edges_before_the_wall_goes_back_to_it():
 
 
 @pytest.mark.parametrize(("views", "stays"), [(2, True), (4, False)])
-def test_shading_of_too_few_views_does_not_move_a_plane_of_edges(views, stays):
+def test_shading_of_two_views_does_not_move_a_plane_of_edges(views, stays):
     maps, depths = photographs(lambda points, view: light(points))
-    # Stereo knows the wall in the other views, whose regions shading is not asked for.
+    # In the other views stereo knows the wall, so that they have no shaded regions.
     confirmed = [depth if view >= views else np.full_like(depth, np.nan) for view, depth in enumerate(depths)]
     edges = np.array([tilted(1.5)])
     assert np.allclose(planes_of(maps, depths, by_edges=edges, confirmed=confirmed).planes[0], edges[0]) == stays
 
 
 @pytest.mark.parametrize(("degrees", "by_depths", "by_angles"), [(2, True, True), (4, False, True), (8, False, False)])
-def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_it(
-    monkeypatch, degrees, by_depths, by_angles
-):
-    """Of two planes at one place the second one is told so."""
+def test_turns_of_planes_from_edges_are_limited(monkeypatch, degrees, by_depths, by_angles):
+    """Two planes are equal; the second one is from edges."""
     planes, turned = np.array([WALL, WALL]), np.array([tilted(degrees), tilted(degrees)])
     region = SimpleNamespace(some=lambda count: region)
     held = ConstrainedPlanes([], [], [[region], [region]])
@@ -441,7 +438,7 @@ def test_what_points_along_edges_have_told_of_a_plane_bounds_how_shading_turns_i
     assert (found == [turned[0], turned[1] if by_angles else WALL]).all()
 
 
-def test_the_fit_goes_downhill_and_ends_at_the_truth_without_noise():
+def test_the_fit_converges_to_the_true_plane_without_noise():
     maps, depths = photographs(lambda points, view: light(points), noise=0.0)
     shadings = [Shading.of(one) for one in maps]
     region = max(shaded_regions(4, shadings[4], np.zeros(depths[4].shape, bool)), key=lambda one: len(one.row))
@@ -458,7 +455,7 @@ def lines_at(monkeypatch, moved):
     monkeypatch.setattr(shaded_planes, "on_meeting_lines", lambda *_: moved)
 
 
-def test_a_wall_behind_a_plane_with_points_takes_its_place_in_plain_regions(monkeypatch):
+def test_a_wall_behind_a_point_plane_replaces_it_in_plain_regions(monkeypatch):
     maps, depths = photographs(lambda points, view: light(points))
     before = WALL + [0, 0, 0, 0.004]
     lines_at(monkeypatch, {1: WALL})
@@ -472,7 +469,7 @@ def test_a_wall_behind_a_plane_with_points_takes_its_place_in_plain_regions(monk
 
 
 @pytest.mark.parametrize(("degrees", "stands"), [(0.1, True), (12.0, False)])
-def test_shading_refuses_a_line_that_it_contradicts(monkeypatch, degrees, stands):
+def test_shading_refuses_a_contradicting_meeting_line(monkeypatch, degrees, stands):
     maps, depths = photographs(lambda points, view: light(points))
     turned = np.array([np.sin(np.radians(degrees)), np.cos(np.radians(degrees)), 0, 0])
     lines_at(monkeypatch, {0: turned})
@@ -483,7 +480,7 @@ def test_shading_refuses_a_line_that_it_contradicts(monkeypatch, degrees, stands
     assert (np.abs(found.planes[0] @ turned) > 1 - 1e-9) == stands
 
 
-def test_known_planes_near_a_regions_own_may_leave_more_of_its_shading():
+def test_known_planes_near_the_own_plane_may_fit_the_shading_less_well():
     maps, depths = photographs(lambda points, view: light(points))
     found = planes_of(maps, depths)
     one = next(one for own in found.regions for one in own if one.fit is not None)

@@ -1,4 +1,4 @@
-"""What photographs show of a wall with stripes of two colours, and of a plane before it."""
+"""Colours of photographs on a wall with stripes, and on a wrong plane in front of it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def at(camera, y: float) -> np.ndarray:
 
 
 def photographs(colours=(RED, CREAM), exposures=None, seed: int = 0) -> tuple[list[DepthMap], list[np.ndarray]]:
-    """Photographs with noise of the wall, and its depths."""
+    """Noisy photographs of the wall, and its depths."""
     maps, depths = [], []
     for number, camera in enumerate(CAMERAS):
         depth = at(camera, 2.0)
@@ -46,13 +46,13 @@ def photographs(colours=(RED, CREAM), exposures=None, seed: int = 0) -> tuple[li
 
 
 def points(y: float, x: float = 0.2, width: float = 0.08) -> np.ndarray:
-    """A patch, in a stripe of the wall if it is on that."""
+    """Points of a patch, which lies within one stripe if it is on the wall."""
     across, up = np.meshgrid(np.linspace(x, x + width, 20), np.linspace(-0.2, 0.2, 20))
     return np.stack([across.ravel(), np.full(across.size, y), up.ravel()], axis=1)
 
 
 @pytest.mark.parametrize("grey_only", [False, True])
-def test_what_shows_through_a_plane_changes_and_what_is_on_a_wall_does_not(grey_only):
+def test_colours_differ_on_a_wrong_plane_and_agree_on_the_wall(grey_only):
     maps, depths = photographs()
     maps = [replace(found, colours=None) for found in maps] if grey_only else maps
     shown = ShownColours(maps, depths)
@@ -61,25 +61,25 @@ def test_what_shows_through_a_plane_changes_and_what_is_on_a_wall_does_not(grey_
     assert sum(shown.differ(view, points(0.5), UP) for view in range(len(maps))) > len(maps) / 2
 
 
-def test_before_a_wall_of_one_colour_nothing_differs():
+def test_colours_agree_in_front_of_a_uniform_wall():
     shown = ShownColours(*photographs((CREAM, CREAM)))
     assert not any(shown.differ(view, points(0.5), UP) for view in range(len(CAMERAS)))
 
 
-def test_exposure_is_no_colour():
+def test_exposure_does_not_make_colours_differ():
     exposures = np.array([0.7, 1.2, 0.8, 1.0, 0.75, 1.15, 0.9, 1.1])
     shown = ShownColours(*photographs(exposures=exposures))
     assert not any(shown.differ(view, points(2.0), UP) for view in range(len(CAMERAS)))
     np.testing.assert_allclose([shown.gain[0, 1, 0]], [np.log((RED[0] * 1.2 + 32) / (RED[0] * 0.7 + 32))], atol=0.15)
 
 
-def test_clipped_values_tell_nothing():
+def test_clipped_values_are_not_used():
     shown = ShownColours(*photographs(((255.0,) * 3, (255.0, 180.0, 255.0))))
     assert not any(shown.differ(view, points(0.5), UP) for view in range(len(CAMERAS)))
 
 
-def test_views_that_cannot_tell_are_not_asked():
-    """What is hidden from them, what they see from behind or along it, too few of them or of the points."""
+def test_hidden_oblique_or_too_few_views_are_not_used():
+    """Patches that are hidden or seen at grazing angles are not compared, nor with too few views or points."""
     maps, depths = photographs()
     whole = ShownColours(maps, depths)
     view = next(view for view in range(len(maps)) if whole.differ(view, points(0.5), UP))
@@ -87,7 +87,7 @@ def test_views_that_cannot_tell_are_not_asked():
     assert not whole.differ(view, points(0.5)[: FEWEST - 1], UP) and not whole.differ(view, np.zeros((0, 3)), UP)
     few = [view, *[number for number in range(len(maps)) if number != view][:2]]
     assert not ShownColours([maps[k] for k in few], [depths[k] for k in few]).differ(0, points(0.5), UP)
-    # Something nearer is known where the others see the patch; the rest still tells their exposure.
+    # Nearer depths hide the patch in the other views. The remaining pixels still give their exposure.
     hidden = [depth.copy() for depth in depths]
     for number in set(range(len(maps))) - {view}:
         place = CAMERAS[number].project(points(0.5))[0].astype(int)
