@@ -1,5 +1,4 @@
-"""The level of a surface chosen by photographs: found where the depth is true, left alone where photographs do not
-say."""
+"""Choice of the iso-level by photographs: the true one is found, and the usual one is kept without evidence."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ def scene(tmp_path_factory):
 
 
 def run_of(scene, true_level: float, share: float = 0.04):
-    """A run whose surface at `true_level` is the true one, and at other levels lies off by `share` of the depth per
+    """A run whose surface is the true one at `true_level`. At other levels it is off by `share` of the depth per
     level."""
 
     def surface_depths(views, level):
@@ -44,13 +43,13 @@ def run_of(scene, true_level: float, share: float = 0.04):
 
 
 @pytest.mark.parametrize("true_level", [0.45, 0.6, 0.85])
-def test_the_true_surface_is_found(scene, true_level):
+def test_the_level_of_the_true_surface_is_chosen(scene, true_level):
     level, differences = choose_level(run_of(scene, true_level))
     assert level == pytest.approx(true_level, abs=0.06)
     assert tuple(differences) == LEVELS and choose_level(run_of(scene, true_level)) == (level, differences)
 
 
-def test_only_the_depth_maps_of_some_views_are_held_at_once(scene, monkeypatch):
+def test_the_number_of_depth_maps_in_memory_is_limited(scene, monkeypatch):
     run, held = run_of(scene, 0.6), [0, 0]
     plain = run.surface_depths
 
@@ -73,19 +72,19 @@ def test_only_the_depth_maps_of_some_views_are_held_at_once(scene, monkeypatch):
         assert held[1] <= most * len(LEVELS)
 
 
-def test_beyond_the_levels_the_nearest_is_taken(scene):
+def test_true_levels_out_of_range_give_the_nearest_one(scene):
     assert LEVELS[0] <= choose_level(run_of(scene, 0.1))[0] < 0.32
     assert choose_level(run_of(scene, 1.2))[0] == LEVELS[-1]
 
 
-def test_photographs_that_do_not_say_leave_the_usual_level(scene):
+def test_the_usual_level_is_kept_without_evidence(scene):
     few = replace(scene, train=scene.train[:1])
     assert choose_level(run_of(few, 0.6)) == (USUAL_LEVEL, {}) and LEVELS[0] < USUAL_LEVEL < LEVELS[-1]
     level, differences = choose_level(run_of(scene, 0.6, share=0.0))  # the same surface at all levels
     assert level == USUAL_LEVEL and len(set(differences.values())) == 1
 
 
-def test_pixels_that_are_hidden_in_the_other_view_do_not_count(scene):
+def test_occluded_pixels_do_not_count(scene):
     one, other = scene.train[0], scene.train[1]
     depth, other_depth = one.load_depth(), other.load_depth()
     photos = one.load(), other.load()
@@ -95,7 +94,7 @@ def test_pixels_that_are_hidden_in_the_other_view_do_not_count(scene):
     assert seen.mean() < 8  # of 255: the same places have the same colours
 
 
-def test_the_unit_of_length_does_not_matter(scene):
+def test_color_differences_do_not_depend_on_the_unit_of_length(scene):
     one, other = scene.train[:2]
 
     def differences(scale):
@@ -107,7 +106,7 @@ def test_the_unit_of_length_does_not_matter(scene):
     assert small.shape == usual.shape and np.allclose(small, usual)
 
 
-def test_of_levels_that_are_as_good_the_nearest_is_taken():
+def test_of_equally_good_levels_the_nearest_to_the_cameras_is_taken():
     places = np.array(LEVELS)
     values = 1 + (places - 0.5) ** 2
     found = nearest_good(LEVELS, values)

@@ -1,4 +1,4 @@
-"""Primitives as meshes of known volume, and the command that turns files into others."""
+"""Meshes of primitives with known volume, and the command `convert`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from linprim_geo.surface.texture.texture_files import load_texture, save_texture
 # --- meshes ----------------------------------------------------------------------------------------------
 
 
-def test_the_mesh_of_the_primitives_is_the_primitives():
+def test_triangle_meshes_of_octahedra_are_exact():
     octahedra = random_octahedra(40)
     mesh = octahedra.triangle_mesh()
     assert mesh.vertices.shape == (240, 3) and mesh.faces.shape == (320, 3)
@@ -74,7 +74,7 @@ def test_colours_and_alpha_of_the_mesh(tmp_path):
     assert description["accessors"][color]["type"] == "VEC4"
 
 
-def test_gaussians_become_ellipsoids(tmp_path):
+def test_gaussians_convert_to_ellipsoids(tmp_path):
     import trimesh
 
     gaussians = replace(random_gaussians(1), extent=np.array([[0.3, 0.2, 0.1]]))
@@ -89,7 +89,7 @@ def test_gaussians_become_ellipsoids(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb", ".stl"])
-def test_primitives_become_meshes(tmp_path, suffix, capsys):
+def test_primitives_convert_to_meshes(tmp_path, suffix, capsys):
     import trimesh
 
     octahedra = random_octahedra(20)
@@ -106,7 +106,7 @@ MESH_FORMATS = (".ply", ".obj", ".glb", ".stl")
 
 
 def painted_ball() -> Mesh:
-    """A sphere with everything that a mesh can have."""
+    """A sphere with all attributes of meshes."""
     import trimesh
 
     ball = trimesh.creation.icosphere(2)
@@ -155,7 +155,7 @@ def textured_ball(size=32):
 
 @pytest.mark.parametrize("first", [".obj", ".glb"])
 @pytest.mark.parametrize("second", [".obj", ".glb"])
-def test_a_texture_goes_along(tmp_path, first, second):
+def test_textures_are_converted(tmp_path, first, second):
     ball, texture = textured_ball()
     save_textured(tmp_path / f"a{first}", ball, texture)
     report = convert(tmp_path / f"a{first}", tmp_path / f"b{second}")
@@ -163,14 +163,14 @@ def test_a_texture_goes_along(tmp_path, first, second):
     mesh, after = load_texture(tmp_path / f"b{second}")
     np.testing.assert_array_equal(after.image, texture.image)
     np.testing.assert_allclose(after.uv, texture.uv, atol=1e-6)
-    # Seams have split vertices on the way; they are whole again.
+    # Vertices that files split at seams are merged again.
     assert len(mesh.vertices) == len(ball.vertices)
     np.testing.assert_allclose(mesh.vertices[mesh.faces], ball.vertices[ball.faces], rtol=0, atol=5e-7)
     np.testing.assert_allclose(mesh.normals[mesh.faces], ball.normals[ball.faces], rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl"])
-def test_where_a_texture_has_no_place_that_is_said(tmp_path, suffix, capsys):
+def test_textures_left_out_are_reported(tmp_path, suffix, capsys):
     ball, texture = textured_ball()
     texture.image[:] = (200, 100, 50)
     save_textured(tmp_path / "a.obj", ball, texture)
@@ -183,7 +183,7 @@ def test_where_a_texture_has_no_place_that_is_said(tmp_path, suffix, capsys):
     assert load_texture(tmp_path / "a.obj") is not None and load_texture(tmp_path / f"b{suffix}") is None
 
 
-def test_the_colour_of_a_material_is_in_the_texture(tmp_path):
+def test_material_colours_multiply_the_texture(tmp_path):
     import trimesh
     from PIL import Image
 
@@ -199,8 +199,8 @@ def test_the_colour_of_a_material_is_in_the_texture(tmp_path):
 @pytest.mark.parametrize(
     ("make", "thickness"), [(random_octahedra, 1.25), (random_tetrahedra, 1.25), (random_gaussians, None)]
 )
-def test_scenes_go_from_file_to_file_unchanged(make, thickness, tmp_path):
-    """npz -> ply -> npz -> ply -> ply: to float32, and what has been through a file once stays as it is."""
+def test_primitives_survive_round_trips(make, thickness, tmp_path):
+    """npz -> ply -> npz -> ply -> ply: equal up to float32, and stable after the first file."""
     before = make(100, 16) if thickness is None else make(100, 16, thickness=thickness)
     save_primitives(tmp_path / "a.npz", before)
     for source, target in (("a.npz", "b.ply"), ("b.ply", "c.npz"), ("c.npz", "d.ply"), ("d.ply", "e.ply")):
@@ -219,7 +219,7 @@ def test_scenes_go_from_file_to_file_unchanged(make, thickness, tmp_path):
     np.testing.assert_allclose(last.extent, after.extent, rtol=2e-6)
 
 
-def test_linprims_file_becomes_3dgs_gaussians(tmp_path):
+def test_linprim_files_convert_to_3dgs_gaussians(tmp_path):
     octahedra = random_octahedra(30, 16, thickness=1.0)
     write_primitive_ply(tmp_path / "linprim.ply", octahedra)
     convert(tmp_path / "linprim.ply", tmp_path / "gaussians.ply", "gaussians")
@@ -231,7 +231,7 @@ def test_linprims_file_becomes_3dgs_gaussians(tmp_path):
     assert_same(octahedra, after, ("center", "sh"))
 
 
-def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):
+def test_primitives_are_found_in_run_and_model_folders(tmp_path):
     run = tmp_path / "run"
     save_primitives(run / "scene.npz", random_octahedra(3))
     assert find_scene_file(run) == run / "scene.npz"
@@ -246,7 +246,7 @@ def test_a_run_and_a_model_folder_stand_for_their_primitives(tmp_path):
 
 
 @pytest.mark.parametrize(("make", "plural"), [(random_tetrahedra, "tetrahedra"), (random_gaussians, "Gaussians")])
-def test_other_kinds_stay_what_they_are(make, plural, tmp_path):
+def test_tetrahedra_and_gaussians_keep_their_kind(make, plural, tmp_path):
     before = make(20)
     save_primitives(tmp_path / "x.npz", before)
     assert convert(tmp_path / "x.npz", tmp_path / "y.ply")["wrote"].endswith(f"s {plural}")
@@ -258,7 +258,7 @@ def test_other_kinds_stay_what_they_are(make, plural, tmp_path):
     assert convert(tmp_path / "x.npz", tmp_path / "y.glb")["faces"] == 20 * (4 if plural[0] == "t" else 80)
 
 
-def test_octahedra_become_gaussians_when_asked(tmp_path, capsys):
+def test_octahedra_convert_to_gaussians_on_request(tmp_path, capsys):
     octahedra = random_octahedra(9)
     save_primitives(tmp_path / "x.npz", octahedra)
     line = ["convert", str(tmp_path / "x.npz"), str(tmp_path / "y.ply"), "--as", "gaussians"]
@@ -269,7 +269,7 @@ def test_octahedra_become_gaussians_when_asked(tmp_path, capsys):
     np.testing.assert_allclose(after.density, octahedra.alpha, rtol=1e-5)
 
 
-def test_thick_rows_are_reported_by_the_command(tmp_path, capsys):
+def test_primitives_that_are_too_thick_are_reported(tmp_path, capsys):
     save_primitives(tmp_path / "x.npz", random_octahedra(6, thickness=9.0))
     assert cli.main(["convert", str(tmp_path / "x.npz"), str(tmp_path / "y.ply")]) == 0
     assert "6 are thicker" in capsys.readouterr().out
@@ -294,7 +294,7 @@ def test_thick_rows_are_reported_by_the_command(tmp_path, capsys):
         ("short.ply", "y.npz", "auto", "truncated"),
     ],
 )
-def test_what_cannot_be_converted_writes_nothing(tmp_path, source, target, how, sentence, capsys):
+def test_invalid_conversions_are_refused_and_write_nothing(tmp_path, source, target, how, sentence, capsys):
     save_primitives(tmp_path / "x.npz", random_octahedra(3))
     save_primitives(tmp_path / "tetra.npz", random_tetrahedra(3))
     (tmp_path / "x.txt").write_text("text")

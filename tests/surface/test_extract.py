@@ -1,4 +1,4 @@
-"""Meshes out of runs: against a surface that is known exactly, in every format, and what is refused."""
+"""Meshes of runs: accuracy against an exact surface, file formats, and refused options."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def outputs(folder):
     return sorted(path.name for path in folder.rglob("*") if path.is_file())
 
 
-def test_what_is_written(extracted, solid):
+def test_output_files_and_stats(extracted, solid):
     stats, folder = extracted
     assert outputs(folder) == ["mesh.ply", "mesh_shaded.png", "mesh_visible.ply", "stats.json"]
     assert STATS <= stats.keys()
@@ -101,13 +101,13 @@ def test_what_is_written(extracted, solid):
     assert stats["visible"].keys() == topology(load_mesh(folder / "mesh.ply")).keys()
 
 
-def test_the_share_of_vertices_that_nothing_confirms_is_told_where_it_is_known():
+def test_error_summary_has_the_unconfirmed_share_if_known():
     quality = np.array([0.1, 0.2, 0.3, 0.3, np.nan], np.float32)
     assert error_summary(quality, 0.3) == pytest.approx({"median": 0.25, "q90": 0.3, "unconfirmed": 0.5})
     assert "unconfirmed" not in error_summary(quality) and error_summary(None, 0.3) is None
 
 
-def test_the_mesh_is_the_surface(extracted, solid):
+def test_the_mesh_agrees_with_the_reference(extracted, solid):
     stats, folder = extracted
     mesh, reference = load_mesh(folder / "mesh.ply"), load_mesh(solid.parent / "scene" / "reference.ply")
     scores = score_mesh(mesh, reference, samples=20_000)
@@ -121,7 +121,7 @@ def test_the_mesh_is_the_surface(extracted, solid):
     assert np.abs(mesh.vertices.mean(0) - np.array(CENTER)).max() < 0.05
 
 
-def test_normals_point_outward_and_colours_are_those_of_the_photographs(extracted):
+def test_normals_point_outward_and_colours_agree_with_photographs(extracted):
     mesh = load_mesh(extracted[1] / "mesh.ply")
     outward = mesh.vertices - np.array(CENTER)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -133,7 +133,7 @@ def test_normals_point_outward_and_colours_are_those_of_the_photographs(extracte
     assert (np.abs(colors - 178).max(1) < 20).mean() > 0.95
 
 
-def test_what_no_camera_sees_is_not_in_the_visible_mesh(extracted):
+def test_the_visible_mesh_is_a_subset_of_the_mesh(extracted):
     stats, folder = extracted
     whole, visible = (load_mesh(folder / name) for name in ("mesh.ply", "mesh_visible.ply"))
     assert 0.9 * len(whole.faces) <= len(visible.faces) == stats["visible"]["faces"] <= len(whole.faces)
@@ -143,7 +143,7 @@ def test_what_no_camera_sees_is_not_in_the_visible_mesh(extracted):
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb", ".stl", ".PLY"])
-def test_every_format_holds_the_same_surface(suffix, solid, extracted, tmp_path):
+def test_all_formats_contain_the_same_surface(suffix, solid, extracted, tmp_path):
     options = ExtractOptions(voxel_size=0.08)
     stats = extract_mesh(solid, output=tmp_path / f"part{suffix}", options=options, quiet=True)
     assert outputs(tmp_path) == sorted([f"part{suffix}", "part_shaded.png", f"part_visible{suffix}"])
@@ -171,13 +171,13 @@ def test_the_level_moves_the_surface_of_a_soft_body(tmp_path):
     assert volumes[1] < 0.85 * volumes[0]
 
 
-def test_the_same_run_gives_the_same_mesh(tiny_run, tmp_path):
+def test_extraction_is_reproducible(tiny_run, tmp_path):
     for name in ("a", "b"):
         extract_mesh(tiny_run, output=tmp_path / f"{name}.ply", quiet=True)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_a_trained_part_is_near_the_truth(tiny_run, tiny_scene, tmp_path):
+def test_a_trained_part_is_accurate(tiny_run, tiny_scene, tmp_path):
     stats = extract_mesh(tiny_run, output=tmp_path / "m.ply", quiet=True)
     scores = score_mesh(load_mesh(stats["mesh"]), load_mesh(tiny_scene / "reference.ply"), samples=20_000)
     # 12 photographs of 48 pixels: a pixel is 2 % of the diagonal. Measured (see tests/README.md): 0.94 to 1.09 %, F1
@@ -205,13 +205,13 @@ def test_no_surface_at_the_level_writes_nothing(tmp_path):
         ({"smallest_part": 2.0}, "smallest"),
     ],
 )
-def test_options_that_cannot_be_used_are_refused(change, match, solid, tmp_path):
+def test_invalid_options_are_refused(change, match, solid, tmp_path):
     with pytest.raises(LinprimError, match=match):
         extract_mesh(solid, output=tmp_path / "m.ply", options=replace(ExtractOptions(), **change), quiet=True)
     assert outputs(tmp_path) == []
 
 
-def test_a_wrong_suffix_or_method_is_refused_before_anything_is_rendered(solid, tmp_path, monkeypatch):
+def test_invalid_suffix_or_method_is_refused_before_rendering(solid, tmp_path, monkeypatch):
     monkeypatch.setattr(Run, "render_views", lambda *_, **__: pytest.fail("rendered"))
     with pytest.raises(LinprimError, match="suffix.*'.xyz'"):
         extract_mesh(solid, output=tmp_path / "m.xyz", quiet=True)
@@ -227,7 +227,7 @@ def test_a_wrong_suffix_or_method_is_refused_before_anything_is_rendered(solid, 
         ("opacity-field", {"depth_limit": 5.0}, "tsdf"),
     ],
 )
-def test_an_option_that_the_method_has_no_use_for_is_refused(method, change, methods, solid, tmp_path):
+def test_options_of_other_methods_are_refused(method, change, methods, solid, tmp_path):
     (name,) = change
     sentence = f"--{name.replace('_', '-')} is for --method {methods}, not for {method}"
     with pytest.raises(LinprimError, match=sentence):
@@ -235,13 +235,13 @@ def test_an_option_that_the_method_has_no_use_for_is_refused(method, change, met
     assert outputs(tmp_path) == []
 
 
-def test_a_run_that_saved_nothing_is_one_sentence(run_copy):
+def test_a_run_without_results_is_refused(run_copy):
     (run_copy / "run.json").unlink()
     with pytest.raises(LinprimError, match="run.json is missing"):
         extract_mesh(run_copy, quiet=True)
 
 
-def test_frames_are_in_the_frame_of_the_data_set(solid):
+def test_depth_frames_are_in_the_coordinates_of_the_data_set(solid):
     run = Run.open(solid)
     frames = DepthFrames(run, 0.5)
     shape = run.primitives().triangle_mesh()
@@ -256,7 +256,7 @@ def test_frames_are_in_the_frame_of_the_data_set(solid):
     assert not (frames[0].background & hit).any() and frames[0].background[~hit].all()
 
 
-def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
+def test_depths_beyond_the_limit_are_clamped(solid):
     run = Run.open(solid)
     near = DepthFrames(run, 0.5)
     assert near.clamped_share == 0 and all(frame.clamped is None for frame in near)
@@ -270,8 +270,8 @@ def test_depths_that_no_disparity_can_tell_apart_are_clamped(solid):
 
 
 @pytest.mark.parametrize("within", [0.03, 0.08])
-def test_depths_are_sharp_where_the_light_is_gone_within_a_twentieth_of_them(tmp_path, within):
-    """A density at which the transmittance falls from 0.9 to 0.3 within a share of the depth, along a ray."""
+def test_depths_are_sharp_if_transmittance_falls_within_5_percent_of_depth(tmp_path, within):
+    """The density lets the transmittance fall from 0.9 to 0.3 `within` a share of the depth along a ray."""
     clear = Run.open(octahedron_run(tmp_path / "any"))
     depth = float(np.median(np.concatenate([frame.depth[frame.depth > 0] for frame in DepthFrames(clear, 0.9)])))
     run = Run.open(octahedron_run(tmp_path / "fog", density=np.log(0.9 / 0.3) / (within * depth)))
@@ -282,7 +282,7 @@ def test_depths_are_sharp_where_the_light_is_gone_within_a_twentieth_of_them(tmp
     assert share > 0.9 if within < 0.05 else share < 0.1
 
 
-def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
+def test_the_depth_limit_is_where_a_quarter_pixel_equals_the_truncation():
     cameras = [
         replace(Camera(64, 48, 500.0, 500.0, 32.0, 24.0, np.eye(4)), world_to_camera=_shifted(x)) for x in (0.0, 6.0)
     ]
@@ -293,7 +293,7 @@ def test_the_depth_limit_is_where_a_quarter_of_a_pixel_is_a_truncation():
     assert depth_limit(cameras[:1], 2.0) == 8.0
 
 
-def test_depths_of_stereo_go_as_far_as_the_largest_voxels_bear(solid):
+def test_far_depths_extend_to_the_truncation_of_the_largest_voxels(solid):
     run = Run.open(solid)
     frames = DepthFrames(run, 0.5)
     depth = float(np.median(frames[0].depth[frames[0].depth > 0]))
@@ -309,7 +309,7 @@ def test_depths_of_stereo_go_as_far_as_the_largest_voxels_bear(solid):
 
 
 @pytest.mark.parametrize("fits", [0.0, 0.5, 1.0])
-def test_far_depths_leave_half_of_the_faces(solid, fits, monkeypatch):
+def test_far_depths_keep_at_least_half_of_the_faces(solid, fits, monkeypatch):
     run = Run.open(solid)
     frames = DepthFrames(run, 0.5)
     near, voxel = frames.up_to(0.1 * frames.limit), auto_voxel_size(frames)
@@ -323,7 +323,7 @@ def test_far_depths_leave_half_of_the_faces(solid, fits, monkeypatch):
     assert taken > (farthest / near.limit) ** (-1 / FAR_TRIES) * most * (1 - 1e-9)
 
 
-def test_voxels_grow_until_the_grid_fits_into_the_limit(solid, tmp_path, capsys):
+def test_voxels_grow_until_the_grid_fits_into_memory(solid, tmp_path, capsys):
     options = ExtractOptions(level=0.5, refine=0, denoise="off")
     whole = extract_mesh(solid, output=tmp_path / "whole.ply", options=options, quiet=True)
     # Half a MiB, or 240 blocks, beside what the process takes and a depth map of 64x64 at work.

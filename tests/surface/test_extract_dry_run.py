@@ -1,4 +1,4 @@
-"""What extract-mesh --dry-run says of memory holds for the extraction, and it writes nothing."""
+"""`extract-mesh --dry-run` predicts the memory of the extraction and writes nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FINISHING = ("picture", "refine", "denoise", "untangle", "creases", "outlines", 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Of one octahedron, small."""
+    """A small run of one octahedron."""
     return octahedron_run(tmp_path_factory.mktemp("dry"), views=12, size=64)
 
 
@@ -40,7 +40,7 @@ def fresh(*words):
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-def test_the_peak_of_each_stage_is_within_a_quarter(tmp_path):
+def test_predicted_peak_memory_is_within_25_percent(tmp_path):
     large = octahedron_run(tmp_path, views=40, size=400)
     voxel = ("--voxel-size", "0.006", "--threads", "1")
     before = everything(large)
@@ -55,14 +55,14 @@ def test_the_peak_of_each_stage_is_within_a_quarter(tmp_path):
     assert said["memory_gib"] == max(said["peak_gib"].values()) and said["fits"]
 
 
-def test_people_read_lines(run, capsys):
+def test_the_command_prints_readable_lines(run, capsys):
     assert main(["extract-mesh", str(run), "--dry-run", "--stereo", "off", "--voxel-size", "0.05"]) == 0
     out = capsys.readouterr().out
     for words in ("faces out of 12 photographs, voxels of about 0.05, no stereo", "memory: level 0.", "nothing was"):
         assert words in out
 
 
-def test_stereo_counts_with_the_size_of_photographs_that_fits(run, monkeypatch):
+def test_stereo_memory_is_that_of_photographs_that_fit(run, monkeypatch):
     cameras = [view.camera for view in Run.open(run).scene().train]
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 20)
@@ -80,7 +80,7 @@ def test_stereo_counts_with_the_size_of_photographs_that_fits(run, monkeypatch):
         extraction_memory(run, replace(with_none, stereo="on"), quiet=True)
 
 
-def test_a_grid_that_does_not_fit_has_fewer_faces(run):
+def test_a_memory_limit_reduces_the_number_of_faces(run):
     options = ExtractOptions(level=0.5, stereo="off")
     whole = extraction_memory(run, options, quiet=True)
     limited = extraction_memory(run, replace(options, memory_limit=PROCESS_GIB + 1.5e6 / 2**30), quiet=True)
@@ -88,7 +88,7 @@ def test_a_grid_that_does_not_fit_has_fewer_faces(run):
     assert limited["peak_gib"]["finish"] < whole["peak_gib"]["finish"]
 
 
-def test_what_does_not_fit_is_said(run, monkeypatch):
+def test_extractions_that_do_not_fit_are_reported(run, monkeypatch):
     monkeypatch.setattr(dry_run, "available_memory", lambda: 0)
     monkeypatch.setattr(dry_run, "memory_gib", lambda: 0.01)
     report = extraction_memory(run, ExtractOptions(level=0.5, stereo="off", voxel_size=0.05), quiet=True)
@@ -96,6 +96,6 @@ def test_what_does_not_fit_is_said(run, monkeypatch):
 
 
 @pytest.mark.parametrize("words", [("--blocks", "2"), ("--time-budget", "1m"), ("--method", "polyhedra")])
-def test_only_what_it_knows_is_told(run, capsys, words):
+def test_unsupported_options_are_refused(run, capsys, words):
     assert main(["extract-mesh", str(run), "--dry-run", *words]) == 1
     assert "--dry-run is of --method tsdf, without --blocks and --time-budget" in capsys.readouterr().err

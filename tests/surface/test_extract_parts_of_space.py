@@ -22,7 +22,7 @@ HALF = f"{CENTER[0]},-9,-9,9,9,9"
 
 
 @pytest.mark.parametrize("method", ["tsdf", "polyhedra", "opacity-field"])
-def test_the_surface_within_a_box_is_that_of_the_whole_there(method, solid, tmp_path):
+def test_the_surface_within_a_box_agrees_with_the_whole(method, solid, tmp_path):
     options = replace(OPTIONS, voxel_size=0.05 if method == "tsdf" else 0.0)
     whole, half = (
         extract_mesh(solid, method, tmp_path / f"{len(box)}.ply", replace(options, box=box), quiet=True)
@@ -38,7 +38,7 @@ def test_the_surface_within_a_box_is_that_of_the_whole_there(method, solid, tmp_
     assert np.array_equal(read_box(half["options"]["box"]), read_box(HALF))
 
 
-def test_less_is_fused_within_a_box(solid, tmp_path, capsys):
+def test_a_box_reduces_the_number_of_fused_blocks(solid, tmp_path, capsys):
     for box in ("", HALF):
         extract_mesh(solid, output=tmp_path / "mesh.ply", options=replace(OPTIONS, box=box, voxel_size=0.025))
     # Half of them, and a layer on the border.
@@ -46,7 +46,7 @@ def test_less_is_fused_within_a_box(solid, tmp_path, capsys):
     assert len(blocks) == 2 and blocks[1] < 0.7 * blocks[0]
 
 
-def test_auto_is_what_the_cameras_look_at(solid, tmp_path):
+def test_box_auto_is_the_focus_box_of_the_cameras(solid, tmp_path):
     stats = extract_mesh(solid, output=tmp_path / "mesh.ply", options=replace(OPTIONS, box="auto"), quiet=True)
     wanted = focus_box([view.camera for view in Run.open(solid).scene().train])
     np.testing.assert_array_equal(read_box(stats["options"]["box"]), wanted)
@@ -54,13 +54,13 @@ def test_auto_is_what_the_cameras_look_at(solid, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["tsdf", "polyhedra"])
-def test_a_box_without_a_surface_is_one_sentence(method, solid, tmp_path):
+def test_a_box_without_a_surface_is_refused(method, solid, tmp_path):
     options = replace(OPTIONS, box="50,50,50,51,51,51", voxel_size=0.0)
     with pytest.raises(LinprimError, match="50.*51|holds none of the surface"):
         extract_mesh(solid, method, tmp_path / "mesh.ply", options, quiet=True)
 
 
-def test_held_out_photographs_count_when_asked(solid, tmp_path, monkeypatch):
+def test_held_out_photographs_are_used_on_request(solid, tmp_path, monkeypatch):
     finished = []
 
     def finish(mesh, run, *rest, original=postprocess.finish_surface, **how):
@@ -79,7 +79,7 @@ def test_held_out_photographs_count_when_asked(solid, tmp_path, monkeypatch):
     assert meshes[0] != meshes[1]
 
 
-def test_held_out_photographs_count_in_every_part(run_copy, tmp_path):
+def test_held_out_photographs_are_used_in_every_part(run_copy, tmp_path):
     options = ExtractOptions(level=0.5, refine=0, held_out=True)
     files = [tmp_path / f"{blocks}.ply" for blocks in (1, 2)]
     for blocks, file in enumerate(files, 1):

@@ -1,4 +1,4 @@
-"""What cameras see of a mesh, against rays one by one."""
+"""First hits of camera rays on a mesh, compared with individual rays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def camera(width=40, height=30, position=(0.1, 0.0, -3.0), seed=None) -> Camera:
 
 
 def by_rays(mesh: Mesh, view: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and face of each pixel: every ray against every plane, and whether the point is in the triangle."""
+    """Depth and face of each pixel by intersecting every ray with every triangle."""
     rays = view.world_rays().reshape(-1, 3)
     depth, face = np.full(len(rays), np.inf), np.full(len(rays), -1)
     for number, (a, b, c) in enumerate(mesh.vertices[mesh.faces]):
@@ -39,8 +39,8 @@ def by_rays(mesh: Mesh, view: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_soup_around_the_camera_as_by_rays(seed):
-    """Faces before, behind and around the camera, which go through the plane of the pinhole."""
+def test_first_hits_of_random_triangles_agree_with_rays(seed):
+    """Faces in front of, behind and across the plane of the pinhole."""
     rng = np.random.default_rng(seed)
     vertices = np.repeat(2 * rng.normal(size=(200, 3)), 3, axis=0) + 0.6 * rng.normal(size=(600, 3))
     mesh, view = Mesh(vertices, np.arange(600).reshape(-1, 3)), camera(60, 44, (0.1, 0.2, -0.1), seed)
@@ -55,7 +55,7 @@ def test_a_soup_around_the_camera_as_by_rays(seed):
 
 
 @pytest.mark.parametrize("scale", [1e-5, 1.0, 1e6])
-def test_small_faces_are_seen_at_any_scale_without_gaps(scale):
+def test_first_hits_have_no_gaps_at_any_scale(scale):
     ball = sphere(rounds=5, radius=scale)
     view = camera(200, 150, (0.123 * scale, 0.057 * scale, -3.0 * scale))
     views = MeshViews(ball.vertices, ball.faces)
@@ -69,7 +69,7 @@ def test_small_faces_are_seen_at_any_scale_without_gaps(scale):
     assert (depth[hit] < 3 * scale).all()
 
 
-def test_rays_through_edges_and_vertices_see_a_face():
+def test_rays_through_edges_and_vertices_hit_a_face():
     """Pixel centres fall on edges, on diagonals and on vertices of the grid."""
     mesh = grid(8, 8, size=(8.0, 8.0))
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -78,7 +78,7 @@ def test_rays_through_edges_and_vertices_see_a_face():
     assert (face >= 0).all() and (depth == 2).all()
 
 
-def test_of_two_faces_in_one_place_the_first_is_seen():
+def test_the_first_of_coincident_faces_is_hit():
     one = grid(3, 3)
     both = join(one, one)
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -87,13 +87,13 @@ def test_of_two_faces_in_one_place_the_first_is_seen():
     assert (face >= 0).any() and face.max() < len(one.faces)
 
 
-def test_a_mesh_behind_the_camera_is_not_seen():
+def test_a_mesh_behind_the_camera_is_not_hit():
     ball = sphere(rounds=3, center=(0.0, 0.0, -9.0))
     depth, face = MeshViews(ball.vertices, ball.faces).first_hits(camera())
     assert np.isinf(depth).all() and (face == -1).all()
 
 
-def test_the_same_bits_for_any_number_of_threads():
+def test_results_do_not_depend_on_threads():
     ball, before = sphere(rounds=6), ops.threads()
     try:
         found = []
@@ -105,7 +105,7 @@ def test_the_same_bits_for_any_number_of_threads():
     assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True))
 
 
-def test_what_a_camera_sees_is_kept_within_a_limit():
+def test_first_hits_are_cached_up_to_a_limit():
     view, other, ball = camera(), camera(position=(0.2, 0.0, -3.0)), sphere()
     views = MeshViews(ball.vertices, ball.faces, kept_bytes=8 * 40 * 30)
     depth, _ = views.first_hits(view)

@@ -1,4 +1,4 @@
-"""Normals of vertices, and faces that are folded over."""
+"""Vertex normals and folded faces."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def test_vertex_normals_of_a_sphere():
     assert np.abs(vertex_normals(ball) - ball.vertices).max() < edge**2
 
 
-def test_vertex_normals_of_a_cube_whichever_way_its_squares_are_split():
+def test_vertex_normals_of_a_cube_do_not_depend_on_its_triangulation():
     np.testing.assert_allclose(vertex_normals(CUBE), (CUBE.vertices - 0.5) / np.sqrt(0.75), atol=1e-12)
     lonely = replace(CUBE, vertices=np.concatenate([CUBE.vertices, [[5, 5, 5]]]))
     np.testing.assert_array_equal(vertex_normals(lonely)[8], 0.0)
 
 
-def test_vertex_normals_by_the_sum_over_corners():
-    """The definition, corner by corner, with the arc cosine of angles that are not near 0 or pi."""
+def test_vertex_normals_agree_with_the_definition():
+    """Sum face normals weighted by corner angles, which are not near 0 or pi here."""
     mesh = Mesh(np.random.default_rng(1).normal(size=(20, 3)), sphere(rounds=0).faces)
     expected = np.zeros_like(mesh.vertices)
     for face, normal in zip(mesh.faces, face_normals(mesh), strict=True):
@@ -47,7 +47,7 @@ def test_vertex_normals_by_the_sum_over_corners():
     np.testing.assert_allclose(vertex_normals(mesh), expected / np.where(length > 0, length, 1), atol=1e-12)
 
 
-def test_the_same_bits_for_any_number_of_threads():
+def test_results_do_not_depend_on_threads():
     ball = sphere(rounds=6)
     before = ops.threads()
     try:
@@ -60,7 +60,7 @@ def test_the_same_bits_for_any_number_of_threads():
     assert np.array_equal(found[0], found[1]) and np.array_equal(found[0], found[2])
 
 
-def test_a_face_that_is_folded_over():
+def test_folded_faces_are_found():
     mesh = grid(6, 6, size=(1.0, 1.0))
     assert not folded(mesh).any()
     middle = np.abs(mesh.vertices[:, :2] - 0.5).max(1).argmin()

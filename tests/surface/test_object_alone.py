@@ -1,4 +1,4 @@
-"""The object alone: what it stands on is found and cut off, surroundings go, and the plane closes it."""
+"""`--object`: the supporting plane is found and cut off, surroundings are removed, and openings closed."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def above(mesh, height):
 
 
 def dome():
-    """The part above the table of a ball around the origin."""
+    """The part of a ball at the origin that is above the table."""
     return above(trimesh.creation.icosphere(6, 0.4), TABLE)
 
 
 def sheet(reach, hole=None, noise=0.0, spacing=0.02):
-    """A square of the table around the z axis, without a round hole at the middle."""
+    """A square of the table around the z axis, with a round hole in its centre if `hole` is given."""
     across = np.arange(-reach, reach + 1e-9, spacing)
     x, y = np.meshgrid(across, across)
     count = len(across)
@@ -75,12 +75,12 @@ def test_a_dome_on_a_table_becomes_a_closed_solid(noise):
     volume = np.pi * height**2 * (3 * 0.4 - height) / 3
     assert solid.is_winding_consistent and solid.volume == pytest.approx(volume, rel=0.03)
     assert alone.vertices[:, 2].min() == pytest.approx(TABLE, abs=0.004)
-    # What is new is as uncertain as the plane is thick.
+    # New vertices have the margin of the plane as predicted error.
     assert alone.quality[0] == np.float32(0.01)
     assert alone.quality[-1] == pytest.approx(supporting_plane(mesh, CAMERAS, BOX).margin)
 
 
-def test_two_feet_and_a_ring_are_closed_by_the_plane_between_their_borders():
+def test_a_ring_and_a_foot_are_closed_by_the_plane():
     tube = trimesh.creation.annulus(0.2, 0.3, 0.4, sections=64)
     tube.apply_translation([0, 0, TABLE + 0.2])
     tube = above(tube.subdivide_to_size(0.01), TABLE + 0.01)
@@ -100,7 +100,7 @@ def merged(mesh):
     return Mesh(whole.vertices, whole.faces, quality=np.zeros(len(whole.vertices)))
 
 
-def test_surroundings_that_reach_out_of_the_box_go_and_small_pieces_too():
+def test_surroundings_and_small_pieces_are_removed():
     wall = trimesh.creation.box((0.05, 4.0, 4.0)).apply_translation([0.8, 0, 0]).subdivide_to_size(0.1)
     crumb = trimesh.creation.icosphere(2, 0.02).apply_translation([-0.7, 0.5, 0.3])
     foot = np.sqrt(0.4**2 - TABLE**2)
@@ -110,20 +110,20 @@ def test_surroundings_that_reach_out_of_the_box_go_and_small_pieces_too():
     assert about["stands_on"][2] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_wall_that_cameras_look_at_is_nothing_to_stand_on():
+def test_a_wall_is_no_supporting_plane():
     wall = sheet(1.0)
     wall.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
     before = [camera for camera in ring(24, radius=3.0) if camera.center[1] * wall.face_normals[0][1] > 0.5]
     assert supporting_plane(together(wall, dome()), before, BOX) is None
-    # Nor if the photographs are turned.
+    # The same with rotated photographs.
     turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     turned = [replace(camera, world_to_camera=turn @ camera.world_to_camera) for camera in before]
     assert supporting_plane(together(wall, dome()), turned, BOX) is None
 
 
 @pytest.mark.parametrize("turn", [1, -1, 0])
-def test_photographs_may_be_turned(turn):
-    """By 90 degrees, as a telephone held upright writes them."""
+def test_the_plane_is_found_in_rotated_photographs(turn):
+    """Phones held upright write photographs that are rotated by 90 degrees."""
     across = {1: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], -1: [[0, -1, 0], [1, 0, 0], [0, 0, 1]], 0: np.eye(3)}[turn]
     pose = np.eye(4)
     pose[:3, :3] = across
@@ -133,8 +133,8 @@ def test_photographs_may_be_turned(turn):
     np.testing.assert_allclose(plane.normal, [0, 0, 1], atol=1e-6)
 
 
-def test_a_thing_that_reaches_out_of_the_box_stays():
-    """Pieces that end within it are crumbs beside it."""
+def test_an_object_that_extends_out_of_the_box_is_kept():
+    """Pieces that lie within the box are removed as crumbs."""
     column = trimesh.creation.cylinder(0.3, 3.0, sections=64).subdivide_to_size(0.05)
     crumb = trimesh.creation.icosphere(2, 0.05).apply_translation([-0.7, 0.5, 0.3])
     alone, about = object_alone(shown(together(column, crumb)), CAMERAS, BOX)
@@ -142,20 +142,20 @@ def test_a_thing_that_reaches_out_of_the_box_stays():
     assert np.linalg.norm(alone.vertices[:, :2], axis=1).max() < 0.31
 
 
-def test_a_thing_in_the_air_stays_as_it_is():
+def test_an_object_without_a_plane_is_unchanged():
     ball = trimesh.creation.icosphere(4, 0.4)
     alone, about = object_alone(together(ball), CAMERAS, BOX)
     assert about == {"stands_on": None, "cut": 0.0, "closed": 0}
     assert len(alone.faces) == len(ball.faces)
 
 
-def test_a_table_alone_is_one_sentence():
+def test_a_table_without_an_object_is_refused():
     with pytest.raises(LinprimError, match="nothing stands on the plane"):
         object_alone(together(sheet(0.9)), CAMERAS, BOX)
 
 
-def test_what_no_camera_saw_stays_open():
-    """A ball that touches the table: the border of its unseen part is far above it."""
+def test_openings_far_from_the_plane_stay_open():
+    """A ball touches the table; its lower part is unseen, and its border is far above the table."""
     ball = trimesh.creation.icosphere(5, 0.3)
     upper = above(ball, -0.05)
     alone, about = object_alone(shown(together(upper, sheet(1.5))), CAMERAS, BOX)
@@ -163,7 +163,7 @@ def test_what_no_camera_saw_stays_open():
     assert face_areas(alone).sum() == pytest.approx(upper.area, rel=0.01)
 
 
-def test_extraction_takes_the_object_in_the_box_that_the_cameras_look_at(solid, tmp_path):
+def test_extraction_with_object_uses_the_focus_box(solid, tmp_path):
     options = ExtractOptions(level=0.5, refine=0, denoise="off", voxel_size=0.05, object=True)
     stats = extract_mesh(solid, output=tmp_path / "mesh.ply", options=options, quiet=True)
     assert stats["object"]["stands_on"] is None and stats["options"]["box"]

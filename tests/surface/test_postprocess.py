@@ -1,4 +1,4 @@
-"""The last steps of a surface: colours and files."""
+"""Final steps of extraction: refinement, denoising, colours and files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from linprim_geo.surface.postprocess import finish_surface
 
 
 def ring_of(ball, count: int = 8) -> list:
-    """Views around a ball, green before a red background that masks leave out."""
+    """Views around a green ball in front of a masked red background."""
     views = []
     for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
         camera = look_at((4 * np.cos(angle), 4 * np.sin(angle), 0.5), size=(64, 64))
@@ -39,15 +39,15 @@ def finished(mesh, views, folder, **options):
     return finish_surface(mesh, run, options, folder / "mesh.ply", Stages(Progress("extract", 1, quiet=True))).mesh
 
 
-def test_colours_are_not_of_pixels_that_masks_leave_out(tmp_path):
-    """A ball before a red background that masks leave out: not even its outline is red."""
+def test_masked_pixels_do_not_colour_vertices(tmp_path):
+    """Vertices on the outline are not red either."""
     ball = sphere(rounds=3)
     colors = finished(ball, ring_of(ball), tmp_path, denoise="off").colors
     assert (colors[:, 1] > 150).all() and (colors[:, 0] < 50).all()
 
 
 @pytest.mark.parametrize("denoise", ["on", "off"])
-def test_a_surface_that_knows_its_error_is_smooth_within_it(denoise, tmp_path):
+def test_surfaces_with_known_error_are_faired_within_it(denoise, tmp_path):
     ball, rng = sphere(rounds=4), np.random.default_rng(0)
     error = np.where(ball.vertices[:, 2] > 0, 0.02, 1e-4).astype(np.float32)
     rough = ball.vertices * (1 + error * rng.uniform(-1, 1, len(error)))[:, None]
@@ -65,7 +65,7 @@ def test_a_surface_that_knows_its_error_is_smooth_within_it(denoise, tmp_path):
 @pytest.mark.parametrize(
     ("refine", "denoise", "known"), [(2, "off", False), (2, "off", True), (0, "on", False), (0, "off", False)]
 )
-def test_exposure_that_drifts_moves_no_vertex_and_makes_none_less_certain(refine, denoise, known, tmp_path):
+def test_drifting_exposure_does_not_change_the_surface(refine, denoise, known, tmp_path):
     """A rough sheet about a textured plane, whose photographs have one exposure, or gains of 0.78 to 1.28. What is left
     is the rounding of their pixels.
 

@@ -1,4 +1,4 @@
-"""The picture of a mesh before and after it was smoothed."""
+"""Shaded pictures of a mesh before and after smoothing."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ SQUARE = Mesh(np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.a
 
 
 def facing(x: float, tilt: float = 0.0, size: tuple[int, int] = (40, 30)) -> Camera:
-    """At (x, 0, -3), looking along z, turned about y by `tilt`."""
+    """A camera at (x, 0, -3) that looks along z, turned about y by `tilt`."""
     pose = np.eye(4)
     pose[:3, :3] = [[np.cos(tilt), 0, -np.sin(tilt)], [0, 1, 0], [np.sin(tilt), 0, np.cos(tilt)]]
     pose[:3, 3] = -pose[:3, :3] @ [x, 0, -3]
     return Camera(*size, 40.0, 40.0, size[0] / 2, size[1] / 2, pose)
 
 
-def test_a_row_for_each_mesh_from_the_same_cameras(tmp_path):
+def test_each_mesh_has_a_row_of_views(tmp_path):
     half = replace(SQUARE, vertices=SQUARE.vertices * [0.5, 1, 1])
     cameras = [facing(0), facing(0.1), facing(-0.1, size=(30, 40))]
     rows = [shaded_row(each, RayCaster(each.vertices, each.faces), cameras) for each in (SQUARE, half)]
@@ -43,7 +43,7 @@ def test_a_row_for_each_mesh_from_the_same_cameras(tmp_path):
     assert picture[15, 20] == pytest.approx(GREY, abs=1)  # lit from the camera, seen from straight ahead
 
 
-def test_large_photographs_have_small_pictures():
+def test_large_photographs_are_averaged_down():
     large = facing(0).magnified(100)
     picture = shaded_row(SQUARE, RayCaster(SQUARE.vertices, SQUARE.faces), [large])
     factor = 9  # the least by which 4,000 pixels are PIXELS at most
@@ -51,13 +51,13 @@ def test_large_photographs_have_small_pictures():
     assert (picture != 255).any(2).sum() / picture[..., 0].size == pytest.approx(26.7**2 / 1200, rel=0.02)
 
 
-def test_the_most_different_cameras_are_so_by_place_and_by_look():
+def test_most_different_uses_position_and_direction():
     assert most_different([facing(0)]) == [0] and most_different([facing(0), facing(0)]) == [0, 0]
     line = [facing(x) for x in (-2.0, -1.9, 0.0, 1.9, 2.3)]
     assert most_different(line) == [2, 4, 0]
     turned = [facing(0.0, tilt) for tilt in (0.0, 0.1, 1.0, -0.9)]
     assert sorted(most_different(turned)[1:]) == [2, 3]
-    # What rounding leaves between cameras in one place says nothing.
+    # Rounding differences between equal positions are ignored.
     for k, camera in enumerate(turned):
         camera.world_to_camera[0, 3] += 1e-15 * (-1) ** k
     assert sorted(most_different(turned)[1:]) == [2, 3]

@@ -1,4 +1,4 @@
-"""What one camera alone sees of primitives and of meshes."""
+"""Primitives and pieces of meshes that only one camera sees."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def camera_at(x: float, y: float = 0.0) -> Camera:
     return Camera(80, 60, 60.0, 60.0, 40.0, 30.0, look_at(np.array([x, y, 4.0]), np.zeros(3)))
 
 
-def test_the_spread_of_two_views_is_an_eighth_of_the_angle_squared():
+def test_spread_of_two_views_agrees_with_the_closed_form():
     support = Support(torch.zeros(5, 3))
     first, second = camera_at(-0.1), camera_at(0.1)
     support.add(first, torch.tensor([1.0, 1.0, 0.0, 1.0, 1.0]))
@@ -32,7 +32,7 @@ def test_the_spread_of_two_views_is_an_eighth_of_the_angle_squared():
     assert support.alone().tolist() == [False, True, False, False, False]
 
 
-def test_a_capture_whose_views_all_look_alike_has_nothing_alone():
+def test_nothing_is_alone_if_all_views_are_close():
     support = Support(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)) * 0.1)
     for x in np.linspace(-0.01, 0.01, 5):  # a tenth of a degree apart
         support.add(camera_at(x), torch.ones(50))
@@ -51,8 +51,8 @@ def square(z: float, x: float, half: float, count: int) -> tuple[np.ndarray, np.
     )
 
 
-def test_a_piece_that_floats_before_one_camera_is_left_out():
-    """The floater is in the image of the last camera alone; the square at the origin is in all."""
+def test_a_piece_seen_by_one_camera_is_removed():
+    """Only the last camera has the floater in its image; all have the square at the origin."""
     (subject, faces), (floater, more) = square(0.0, 0.0, 0.4, 9), square(2.0, 4.0, 0.1, 4)
     mesh = Mesh(np.concatenate([subject, floater]), np.concatenate([faces, more + len(subject)]))
     cameras = [camera_at(x, y) for x, y in ((-1, 0), (1, 0), (0, 1), (0, -1))]
@@ -70,8 +70,8 @@ def test_a_piece_that_floats_before_one_camera_is_left_out():
     assert again is kept and nothing == {"pieces": 0, "area": 0.0}
 
 
-def test_small_pieces_that_several_cameras_see_stay():
-    """Beside the subject; it is what was cut off from a dropped piece that goes."""
+def test_pieces_seen_by_several_or_no_cameras_stay():
+    """The last piece is removed once a camera sees it alone; the small one beside the subject stays."""
     parts = [square(0.0, 0.0, 0.4, 9), square(0.0, 0.6, 0.01, 4), square(2.0, 4.0, 0.1, 4)]
     first = np.cumsum([0] + [len(vertices) for vertices, _ in parts])
     mesh = Mesh(
@@ -81,7 +81,7 @@ def test_small_pieces_that_several_cameras_see_stay():
     cameras = [camera_at(x, y) for x, y in ((-1, 0), (1, 0), (0, 1), (0, -1))]
     depths = [(camera, np.full((60, 80), 1e3)) for camera in cameras]
     kept, about = without_single_views(mesh, depths, 0.01)
-    # No camera of these sees the last piece; one does not need to be seen to stay.
+    # No camera sees the last piece, and unseen pieces stay.
     assert about["pieces"] == 0 and len(kept.faces) == len(mesh.faces)
     aside = Camera(80, 60, 60.0, 60.0, 40.0, 30.0, look_at(np.array([6.0, 0.0, 4.0]), np.zeros(3)))
     kept, about = without_single_views(mesh, [*depths, (aside, np.full((60, 80), 1e3))], 0.01)

@@ -1,4 +1,4 @@
-"""Stereo in a given time: photographs as large as it allows, or none."""
+"""Stereo within budgets of time and memory: the size of photographs, or no stereo."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PIXELS = (VIEWS - 2) * SIZE**2
 
 @pytest.fixture(scope="module")
 def many_views(tmp_path_factory):
-    """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
+    """A run of one octahedron with enough close views for stereo."""
     return Run.open(octahedron_run(tmp_path_factory.mktemp("many"), views=VIEWS, size=SIZE))
 
 
@@ -46,7 +46,7 @@ def frames(many_views):
 
 @pytest.fixture
 def in_time(many_views, frames, monkeypatch):
-    """Stereo of `seconds` in a budget of SECONDS; depth maps are not made."""
+    """Plan stereo that takes `seconds` in a budget of SECONDS, without computing depth maps."""
     monkeypatch.setattr(stereo_budget, "SMALLEST_SIDE", 20)
     monkeypatch.setattr(DepthFrames, "merged", lambda self, **_: self)
 
@@ -61,7 +61,7 @@ def in_time(many_views, frames, monkeypatch):
 
 
 @pytest.mark.parametrize("seconds, factor", [(0.9, 1), (1.1, 2), (3.9, 2), (4.1, 3), (8.9, 3)])
-def test_photographs_are_as_large_as_the_time_allows(in_time, frames, seconds, factor):
+def test_downscale_follows_from_the_time_budget(in_time, frames, seconds, factor):
     taken, merged, about = in_time(seconds * SHARE * AIM * SECONDS)
     far = with_far_depths(taken, ExtractOptions(level=0.5), auto_voxel_size(taken))
     assert merged.views is taken.views and merged.kept is taken.kept and merged.limit == far.limit
@@ -73,7 +73,7 @@ def test_photographs_are_as_large_as_the_time_allows(in_time, frames, seconds, f
     assert taken.views[0].load().rgb.shape == (SIZE // factor, SIZE // factor, 3)
 
 
-def test_photographs_are_no_larger_than_the_memory_allows(in_time, frames, monkeypatch):
+def test_memory_limits_the_size_of_photographs(in_time, frames, monkeypatch):
     most = stereo_bytes([view.camera for view in frames.views])
     seconds = 0.9 * SHARE * AIM * SECONDS  # for whole ones
     monkeypatch.setattr(method_tsdf, "available_memory", lambda: most / 4)
@@ -84,7 +84,7 @@ def test_photographs_are_no_larger_than_the_memory_allows(in_time, frames, monke
         in_time(seconds, stereo="on")
 
 
-def test_without_the_time_there_is_none_and_who_asks_for_it_is_told(in_time, frames, monkeypatch):
+def test_too_little_time_skips_stereo_or_refuses_it_on_request(in_time, frames, monkeypatch):
     monkeypatch.setattr(Budget, "elapsed", lambda budget: 0.0)  # else the sentence depends on how busy the machine is
     seconds = 9.1 * SHARE * AIM * SECONDS
     assert in_time(seconds) == (frames, None, {})
@@ -92,7 +92,7 @@ def test_without_the_time_there_is_none_and_who_asks_for_it_is_told(in_time, fra
         in_time(seconds, "on")
 
 
-def test_where_small_photographs_have_no_stereo_the_whole_ones_stay(in_time, frames, monkeypatch):
+def test_whole_photographs_are_kept_if_stereo_fails(in_time, frames, monkeypatch):
     def impossible(*_, **__):
         raise LinprimError("no two photographs show the same points")
 
@@ -100,14 +100,14 @@ def test_where_small_photographs_have_no_stereo_the_whole_ones_stay(in_time, fra
     assert in_time(2 * SHARE * AIM * SECONDS) == (frames, None, {})
 
 
-def test_what_is_reserved_is_not_taken(in_time):
+def test_reserved_time_is_not_used(in_time):
     seconds = 0.3 * AIM * SECONDS
     assert in_time(seconds, reserve=0.6 * AIM * SECONDS)[2]["downscale"] == 1
     assert in_time(seconds, reserve=0.8 * AIM * SECONDS)[2]["downscale"] == 2
     assert in_time(seconds, reserve=2 * SECONDS)[1] is None
 
 
-def test_a_surface_in_a_given_time_has_stereo(many_views):
+def test_extraction_with_a_time_budget_uses_stereo(many_views):
     options = ExtractOptions(level=0.5, stereo="on")
     stats = extract_mesh(many_views.path, options=options, time_budget=300.0, quiet=True)
     assert stats["stereo"]["taken"] and stats["refine"] == 0 and stats["faces"] > 0
@@ -115,7 +115,7 @@ def test_a_surface_in_a_given_time_has_stereo(many_views):
 
 
 @pytest.mark.parametrize("factor, taken", [(1, False), (2, True)])
-def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monkeypatch, factor, taken):
+def test_averaged_down_photographs_do_not_decide_about_stereo(many_views, frames, monkeypatch, factor, taken):
     shares = iter((0.9, 0.1))
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
@@ -131,7 +131,7 @@ def test_small_photographs_do_not_speak_against_stereo(many_views, frames, monke
 
 @pytest.fixture
 def little_memory(many_views, monkeypatch):
-    """For stereo of a third of the pixels, of a capture without masks."""
+    """A capture without masks, with memory for stereo of a third of the pixels."""
     cameras = [view.camera for view in many_views.scene().train]
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 12)
@@ -144,7 +144,7 @@ def test_stereo_takes_smaller_photographs_where_memory_is_short(little_memory, m
     options = ExtractOptions(level=0.5)
     assert stereo_factor(little_memory, options) == 2
     assert stereo_factor(little_memory, replace(options, stereo="off")) == 1
-    # What --memory-limit leaves beside what the program takes itself.
+    # The memory of the process itself is subtracted from --memory-limit.
     cameras = [view.camera for view in little_memory.scene().train]
     limit = PROCESS_GIB + stereo_bytes(cameras) / 8 / 2**30
     assert stereo_factor(little_memory, replace(options, memory_limit=limit)) == 3
@@ -155,7 +155,7 @@ def test_stereo_takes_smaller_photographs_where_memory_is_short(little_memory, m
     assert stereo_factor(little_memory, options) == 1
 
 
-def test_without_stereo_a_surface_is_of_whole_photographs_all_the_same(little_memory, monkeypatch):
+def test_failed_stereo_falls_back_to_whole_photographs(little_memory, monkeypatch):
     options = ExtractOptions(level=0.5)
     stages = Stages(Progress("test", 1, quiet=True))
 
@@ -169,7 +169,7 @@ def test_without_stereo_a_surface_is_of_whole_photographs_all_the_same(little_me
     assert about == wanted and (with_small.vertices == whole.vertices).all()
 
 
-def test_stereo_that_does_not_fit_by_any_means_is_none(little_memory, monkeypatch):
+def test_stereo_that_never_fits_is_skipped_or_refused_on_request(little_memory, monkeypatch):
     monkeypatch.setattr(method_tsdf, "SMALLEST_SIDE", 48)
     monkeypatch.setattr(method_tsdf, "MergedFrames", lambda *_, **__: pytest.fail("it does not fit"))
     options, stages = ExtractOptions(level=0.5, voxel_size=0.1), Stages(Progress("test", 1, quiet=True))
@@ -179,7 +179,7 @@ def test_stereo_that_does_not_fit_by_any_means_is_none(little_memory, monkeypatc
         tsdf_surface(little_memory, replace(options, stereo="on"), stages)
 
 
-def test_an_object_with_masks_has_no_stereo_that_does_not_fit(little_memory, monkeypatch):
+def test_objects_with_masks_skip_stereo_that_does_not_fit(little_memory, monkeypatch):
     monkeypatch.setattr(Scene, "has_alpha", True)
     monkeypatch.setattr(method_tsdf, "MergedFrames", lambda *_, **__: pytest.fail("it does not fit"))
     options = ExtractOptions(level=0.5, voxel_size=0.1)

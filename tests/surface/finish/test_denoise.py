@@ -1,4 +1,4 @@
-"""Smoothing of surfaces by the normals of their faces, and where photographs stop it."""
+"""Denoising of surfaces by filtered normals, limited by photo-consistency."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ def rough(mesh: Mesh, deviation: float, seed: int = 0) -> Mesh:
 
 
 def roof(angle: float, steps: int = 41) -> Mesh:
-    """Two planes that meet along y under an angle in degrees, noise of a tenth of an edge on them."""
+    """Two planes that meet along y at an angle in degrees, with noise of a tenth of an edge length."""
     slope = np.tan(np.radians(angle / 2))
     return rough(sheet(lambda x, y: -slope * np.abs(x), steps=steps), 0.0025)
 
 
 def filtered_in_numpy(mesh: Mesh, bound: np.ndarray, contrast: float, normal_rounds: int, vertex_rounds: int):
-    """The formulas of csrc/surface/filter_normals.h, written out."""
+    """The formulas of csrc/surface/filter_normals.h in numpy."""
     vertices, faces = mesh.vertices.astype(np.float64), mesh.faces
     normal, area = face_normals(mesh), face_areas(mesh)
     fans = [np.nonzero((faces == v).any(1))[0] for v in range(len(vertices))]
@@ -51,7 +51,7 @@ def filtered_in_numpy(mesh: Mesh, bound: np.ndarray, contrast: float, normal_rou
     return vertices
 
 
-def test_the_core_does_what_the_formulas_say():
+def test_filter_normals_agrees_with_numpy():
     mesh = roof(60, steps=9)
     bound = np.random.default_rng(1).uniform(0, 0.003, len(mesh.vertices))
     found = np.array(mesh.vertices, np.float64, order="C")
@@ -66,7 +66,7 @@ def tilts(mesh: Mesh, side: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [45, 90])
-def test_planes_become_flat_and_the_edge_between_them_stays(angle):
+def test_planes_are_flattened_and_the_edge_is_kept(angle):
     mesh = roof(angle)
     smooth = replace(mesh, vertices=filtered(mesh, np.full(len(mesh.vertices), 0.02)))
     half = np.radians(angle / 2)
@@ -85,7 +85,7 @@ def test_no_vertex_moves_farther_than_its_bound():
     assert (moved <= bound * (1 + 1e-9)).all() and np.isclose(moved[bound > 0], 1e-4).mean() > 0.5
 
 
-def test_the_same_bits_for_any_number_of_threads(few_threads):
+def test_results_do_not_depend_on_threads(few_threads):
     mesh = rough(sheet(lambda x, y: 0.1 * x * y, steps=101), 0.001)
     bound = np.full(len(mesh.vertices), 0.01)
     one = filtered(mesh, bound)
@@ -93,7 +93,7 @@ def test_the_same_bits_for_any_number_of_threads(few_threads):
     assert (filtered(mesh, bound) == one).all()
 
 
-def test_faces_without_area_and_vertices_without_faces_do_no_harm():
+def test_degenerate_faces_and_unused_vertices_are_harmless():
     mesh = roof(90)
     corner = len(mesh.vertices)
     odd = Mesh(
@@ -115,7 +115,7 @@ def test_wrong_arrays_are_refused():
         surface_ops.filter_normals(corners[:0], np.zeros(3), 0.0, 1, 1, vertices)
 
 
-def test_wrinkles_go_where_photographs_do_not_tell_them_from_the_surface():
+def test_noise_is_removed_where_photographs_have_little_texture():
     faint = [Shown(view, lambda x, y: 0.5 + 0.05 * (texture(x, y) - 0.5)) for view in ring()]
     mesh = rough(sheet(lambda x, y: np.zeros_like(x)), 0.1 * FOOTPRINT)
     smooth, middle = denoised(mesh, faint), inner(mesh)
@@ -127,8 +127,8 @@ def test_wrinkles_go_where_photographs_do_not_tell_them_from_the_surface():
     assert smooth.quality.dtype == np.float32 and np.isfinite(smooth.quality).all()
 
 
-def test_what_photographs_agree_on_stays(monkeypatch):
-    """A plane that is exact, and a filter that lifts all of it by half a footprint."""
+def test_vertices_with_good_photo_consistency_stay(monkeypatch):
+    """The filter is replaced by one that lifts an exact plane by half a footprint."""
     shown, mesh = [Shown(view) for view in ring()], sheet(lambda x, y: np.zeros_like(x))
     monkeypatch.setattr(
         "linprim_geo.surface.finish.denoise.filtered", lambda mesh, bound: mesh.vertices + [0, 0, 0.5 * FOOTPRINT]
@@ -141,7 +141,7 @@ def test_what_photographs_agree_on_stays(monkeypatch):
     assert np.abs(denoised(low, shown).vertices[middle, 2]).max() < 0.05 * FOOTPRINT
 
 
-def test_a_surface_that_no_two_photographs_see_is_left_alone():
+def test_a_surface_seen_by_one_photograph_is_unchanged():
     mesh = rough(sheet(lambda x, y: np.zeros_like(x)), 0.1 * FOOTPRINT)
     smooth = denoised(mesh, [Shown(view) for view in ring()[:1]])
     assert (smooth.vertices == mesh.vertices).all() and np.isnan(smooth.quality).all()

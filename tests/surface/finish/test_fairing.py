@@ -1,4 +1,4 @@
-"""Surfaces between their predicted error and their bending."""
+"""Fairing of surfaces: a balance of predicted error and bending."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from linprim_geo.surface.finish.fairing import BEND, faired
 
 
 def rough(mesh: Mesh, error: np.ndarray, share: float = 0.5) -> Mesh:
-    """With a predicted error, and off by up to a share of it, as neighbours are, too, in height."""
+    """The mesh with a predicted error, and noise in height of up to `share` of it."""
     waves = np.sin(60 * mesh.vertices[:, 0]) * np.sin(50 * mesh.vertices[:, 1])
     vertices = mesh.vertices + np.outer(share * error * waves, [0, 0, 1])
     return replace(mesh, vertices=vertices, quality=error.astype(np.float32))
 
 
 def energy(mesh: Mesh, vertices: np.ndarray) -> float:
-    """What `fairing` says, written out for a mesh of one piece."""
+    """The energy that `fairing` documents, for a mesh of one piece."""
     edges = {(a, b) for face in mesh.faces for a, b in zip(face, np.roll(face, -1), strict=True)}
     length = np.median([np.linalg.norm(mesh.vertices[a] - mesh.vertices[b]) for a, b in edges])
     neighbours: list[set] = [set() for _ in vertices]
@@ -36,7 +36,7 @@ def energy(mesh: Mesh, vertices: np.ndarray) -> float:
     return total
 
 
-def test_the_energy_is_least():
+def test_the_energy_is_minimal():
     error = np.random.default_rng(0).uniform(0.02, 0.2, 13 * 13)
     mesh = rough(sheet(lambda x, y: x * y, steps=13), error)
     found = faired(mesh).vertices
@@ -46,11 +46,11 @@ def test_the_energy_is_least():
     rng = np.random.default_rng(1)
     for _ in range(20):
         change = rng.normal(size=found.shape) * np.outer(~border, [1, 1, 1])
-        # Borders stay in place along the surface, which costs the vertices beside them a little.
+        # Border vertices cannot move along the surface, so that only inner vertices are at the minimum.
         assert energy(mesh, found + 1e-3 * change) > least
 
 
-def test_the_unsure_part_of_a_curved_sheet_follows_the_sure_one():
+def test_uncertain_parts_follow_the_curvature_of_certain_ones():
     def height(x, y):
         return 0.5 * np.sqrt(1 - x**2)
 
@@ -80,7 +80,7 @@ def test_a_hole_does_not_grow():
     assert border.sum() > 20 and np.abs(found[border] - mesh.vertices[border]).max() < 1e-9
 
 
-def test_pieces_and_corners_where_borders_meet_are_no_trouble():
+def test_separate_pieces_and_shared_border_vertices_are_handled():
     # Two triangles that share a corner, and one by itself.
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [5, 0, 0], [6, 0, 0], [5, 1, 0]])
     mesh = Mesh(vertices.astype(float), np.array([[0, 1, 2], [0, 3, 4], [5, 6, 7]]), quality=np.full(8, 0.01))
@@ -88,7 +88,7 @@ def test_pieces_and_corners_where_borders_meet_are_no_trouble():
     assert np.isfinite(found).all() and np.abs(found[:, 2]).max() == 0
 
 
-def test_threads_change_no_bit():
+def test_results_do_not_depend_on_threads():
     mesh = rough(sheet(lambda x, y: x * y), np.full(41 * 41, 0.02))
     before, found = ops.threads(), []
     try:

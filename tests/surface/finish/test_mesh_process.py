@@ -1,5 +1,4 @@
-"""Finishing: shapes whose volume, topology and attributes are known stay what they are, and what cannot be done is
-said."""
+"""Processing of meshes: volume, topology and attributes are kept, and steps that cannot be done are reported."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ ALL_STEPS = (*STEPS, lambda mesh: within_tolerance(mesh, 0.01))
 
 
 def painted(mesh):
-    """Colours and quality that are linear in the place, so that they are known everywhere."""
+    """The mesh with colours and quality that are linear in position."""
     low, high = mesh.bounds
     share = (mesh.vertices - low) / np.maximum(high - low, 1e-30)
     return replace(mesh, colors=np.round(255 * share), quality=share[:, 0], normals=vertex_normals(mesh))
@@ -71,7 +70,7 @@ def radii(mesh):
     return np.linalg.norm(mesh.vertices, axis=1)
 
 
-def test_simplified_flat_parts_lose_their_faces_and_the_outline_stays():
+def test_simplify_keeps_the_outline_of_a_flat_grid():
     flat = simplify(grid(20, 10), 64)
     assert (
         58 <= len(flat.faces) <= 64
@@ -92,20 +91,20 @@ def test_a_torus_stays_a_closed_torus(step):
 
 
 @pytest.mark.parametrize("step", STEPS, ids=NAMES)
-def test_the_result_is_the_same_every_time_and_far_from_the_origin(step):
+def test_results_are_reproducible_and_independent_of_position(step):
     mesh = painted(punctured(sphere(rounds=3), 7))
     once, again = step(mesh), step(mesh)
     for name in ("vertices", "faces", "normals", "colors", "quality"):
         np.testing.assert_array_equal(getattr(once, name), getattr(again, name))
     moved = step(replace(mesh, vertices=mesh.vertices + [1e6, -2e6, 5e5]))
     back = moved.vertices - [1e6, -2e6, 5e5]
-    # A coordinate of 2e6 is rounded by 2e-10, so collapses of equal cost may change places; in single precision by 0.1.
+    # Coordinates of 2e6 are rounded by 2e-10 (0.1 in float32), so collapses of equal cost may change order.
     assert abs(len(back) - len(once.vertices)) <= 0.02 * len(once.vertices)
     assert np.abs(radii(replace(moved, vertices=back)) - 1).max() <= np.abs(radii(once) - 1).max() + 0.02
 
 
 @pytest.mark.parametrize("step", STEPS, ids=NAMES)
-def test_colours_quality_and_normals_are_those_of_the_place(step):
+def test_attributes_are_interpolated(step):
     mesh = painted(sphere(rounds=4))
     after = step(mesh)
     expected = painted(after)
@@ -124,7 +123,7 @@ def test_simplifying_keeps_a_tenth_of_the_faces_on_the_surface():
     assert distance.max() < 0.03 and topology(tenth)["volume"] == pytest.approx(4 / 3 * np.pi, rel=0.04)
 
 
-def test_smoothing_takes_noise_and_leaves_the_volume():
+def test_smoothing_reduces_noise_and_keeps_the_volume():
     rough = noisy_sphere()
     done = smooth(rough, 20)
     assert radii(done).std() < 0.5 * radii(rough).std()
@@ -134,7 +133,7 @@ def test_smoothing_takes_noise_and_leaves_the_volume():
     np.testing.assert_array_equal(done.faces, rough.faces)
 
 
-def test_holes_up_to_the_size_are_closed_and_others_stay():
+def test_only_holes_up_to_the_given_size_are_closed():
     ball = sphere(rounds=3)
     six = punctured(ball, len(ball.vertices) - 1)
     big = select_faces(six, six.vertices[six.faces].mean(1)[:, 2] < 0.6)
@@ -148,7 +147,7 @@ def test_holes_up_to_the_size_are_closed_and_others_stay():
     np.testing.assert_array_equal(all_closed.faces[: len(big.faces)], big.faces)
 
 
-def test_a_patch_that_would_make_an_edge_of_three_faces_is_not_used():
+def test_patches_with_non_manifold_edges_are_rejected():
     old = np.array([[0, 1, 2], [0, 2, 3]])
     added = np.array([[2, 1, 0], [0, 2, 4], [5, 6, 7]])
     assert mesh_process._sound_patches(old, added).tolist() == [False, False, True]
@@ -163,7 +162,7 @@ def test_remeshed_triangles_are_even():
     assert topology(even)["area"] == pytest.approx(2.0, rel=1e-6)
 
 
-def test_the_steps_are_reported_in_their_order(capsys):
+def test_steps_are_reported_in_order(capsys):
     mesh, lines = painted(punctured(sphere(rounds=4), 300)), []
     options = ExtractOptions(close_holes=10, smooth=3, remesh=0.1, tolerance=0.002, target_faces=300)
     done, steps = process_mesh(mesh, options, lines.append)
@@ -177,20 +176,20 @@ def test_the_steps_are_reported_in_their_order(capsys):
     assert process_mesh(mesh, ExtractOptions()) == (mesh, [])
 
 
-def test_more_faces_than_there_are_is_nothing_to_do():
+def test_meshes_with_fewer_faces_than_the_target_are_unchanged():
     mesh = sphere(rounds=2)
     done, (step,) = process_mesh(mesh, ExtractOptions(target_faces=10_000))
     assert done is mesh and "left as it is" in step["note"] and step["topology_kept"]
     assert "no holes" in process_mesh(mesh, ExtractOptions(close_holes=9))[1][0]["note"]
 
 
-def test_what_keeps_its_topology_can_keep_more_faces_than_asked_for():
+def test_topology_takes_precedence_over_the_target_number_of_faces():
     several = join(*(sphere(center=(3.0 * k, 0, 0), rounds=1) for k in range(5)))
     done, (step,) = process_mesh(several, ExtractOptions(target_faces=8))
     assert len(done.faces) > 8 and "no fewer than" in step["note"] and topology(done)["components"] == 5
 
 
-def test_a_closed_mesh_that_pymeshlab_opens_is_simplified_by_libigl(monkeypatch):
+def test_libigl_simplifies_closed_meshes_that_pymeshlab_opens(monkeypatch):
     def opened(mesh, name, **parameters):
         return punctured(real(mesh, name, **parameters), 3)
 
@@ -200,13 +199,13 @@ def test_a_closed_mesh_that_pymeshlab_opens_is_simplified_by_libigl(monkeypatch)
     assert topology(done)["watertight"] and topology(done)["genus"] == 1 and len(done.faces) <= 400
     assert "libigl" in step["note"] and step["topology_kept"] and done.colors is not None
     mesh = torus()
-    assert remesh(mesh, 0.2) is mesh  # there is no second way to remesh
+    assert remesh(mesh, 0.2) is mesh  # there is no fallback for remeshing
     monkeypatch.setattr(mesh_process, "_decimated", lambda mesh, target: punctured(mesh, 3))
     assert simplify(mesh, 400) is mesh
 
 
 @pytest.mark.parametrize("step", ALL_STEPS, ids=(*NAMES, "within_tolerance"))
-def test_meshes_that_cannot_be_used_are_one_sentence(step):
+def test_invalid_meshes_are_refused(step):
     good = sphere(rounds=2)
     broken = good.vertices.copy()
     broken[5, 1] = np.nan
@@ -235,12 +234,12 @@ def test_meshes_that_cannot_be_used_are_one_sentence(step):
         (lambda m: within_tolerance(m, "auto"), "--tolerance is auto, but the mesh has no predicted errors"),
     ],
 )
-def test_parameters_that_cannot_be_used_are_one_sentence(call, match):
+def test_invalid_parameters_are_refused(call, match):
     with pytest.raises(LinprimError, match=match):
         call(sphere(rounds=2))
 
 
-def test_edges_of_three_faces_and_faces_without_area_do_no_harm():
+def test_non_manifold_edges_and_degenerate_faces_are_harmless():
     fan = Mesh(
         [[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, -1, 0], [0, 0, 0.5]],
         [[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 5, 1]],

@@ -1,4 +1,4 @@
-"""Outlines of meshes where masks show them, against bodies whose masks are known exactly."""
+"""Vertices on outlines are moved to the outlines of masks, tested with exact masks of known bodies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FOOTPRINT = np.median([np.linalg.norm(camera.center) for camera in CAMERAS]) / 1
 
 
 class Masked:
-    """A view of what rays hit, by FINE squared rays per pixel; its photograph is black."""
+    """A view whose mask is the share of FINE x FINE rays per pixel that hit a body; its photograph is black."""
 
     def __init__(self, camera, hits, alpha_of=lambda share: np.round(255 * share)):
         rays = camera.magnified(FINE).world_rays().reshape(-1, 3)
@@ -65,7 +65,7 @@ def views():
 
 
 def off_by(mesh):
-    """(V,) pixels by which vertices are outside of the ball."""
+    """(V,) distance of vertices from the ball's surface in pixels."""
     return (np.linalg.norm(mesh.vertices, axis=1) - RADIUS) / FOOTPRINT
 
 
@@ -74,21 +74,21 @@ def moved_of(before, after):
 
 
 @pytest.mark.parametrize("pixels", [-0.3, 0.3])
-def test_a_ball_gets_the_size_that_masks_show(views, pixels):
+def test_vertices_of_a_ball_move_to_the_outline_of_masks(views, pixels):
     mesh = ball(RADIUS + pixels * FOOTPRINT)
     found = moved_to_outlines(mesh, views)
     moved = moved_of(mesh, found)
     assert moved.mean() > 0.1
     assert np.abs(off_by(mesh)[moved]).mean() == pytest.approx(0.3, abs=0.01)
-    assert np.abs(off_by(found)[moved]).mean() < 0.15  # many of these are on the outlines of one or two views alone
+    assert np.abs(off_by(found)[moved]).mean() < 0.15  # many of these are on the outlines of only one or two views
     np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1)
     assert len(crossings(found)[0]) == 0
 
 
-def test_edges_of_a_block_come_back():
+def test_worn_edges_of_a_block_are_restored():
     true = block(0.7)
     views = [Masked(camera, of_mesh(true)) for camera in CAMERAS]
-    # Edges as voxels leave them: half a pixel inside of both sides.
+    # Edges are worn as by voxels: half a pixel inside of both sides.
     worn = true.vertices.copy()
     edge = (np.abs(worn) > 0.7 - 1e-9).sum(1) >= 2
     worn[edge] *= 1 - 0.5 * FOOTPRINT / 0.7
@@ -102,12 +102,12 @@ def test_edges_of_a_block_come_back():
     assert np.abs(found.vertices - worn)[flat].max() < 0.1 * FOOTPRINT
 
 
-def test_what_is_right_stays(views):
+def test_a_correct_ball_stays(views):
     off = np.abs(off_by(moved_to_outlines(ball(RADIUS), views)))
     assert off.max() < 0.1 and off.mean() < 0.01
 
 
-def test_the_share_of_a_pixel_that_one_face_covers():
+def test_covered_shares_of_pixels_agree_with_supersampling():
     face = Mesh(np.array([[-0.8, -0.5, 0.0], [0.9, -0.4, 0.1], [0.1, 0.8, -0.2]]), np.array([[0, 1, 2]]))
     for camera in CAMERAS[:3]:
         covered, _, near = _covered(camera, MeshViews(face.vertices, face.faces))
@@ -115,7 +115,7 @@ def test_the_share_of_a_pixel_that_one_face_covers():
         assert near.sum() > 50 and np.abs(covered - wanted)[near].mean() < 0.08
 
 
-def test_masks_that_do_not_tell_shares_have_no_say():
+def test_binary_or_missing_masks_are_not_used():
     mesh = ball(RADIUS - 0.3 * FOOTPRINT)
     for alpha_of in (lambda share: 255 * (share > 0.5), lambda share: np.full_like(share, 255)):
         assert moved_to_outlines(mesh, [Masked(camera, of_ball, alpha_of) for camera in CAMERAS]) is mesh
@@ -125,12 +125,12 @@ def test_masks_that_do_not_tell_shares_have_no_say():
     assert moved_to_outlines(mesh, without) is mesh
 
 
-def test_an_outline_far_from_the_mesh_is_another_one(views):
+def test_distant_outlines_are_ignored(views):
     mesh = ball(RADIUS - 3.5 * FOOTPRINT)
     np.testing.assert_array_equal(moved_to_outlines(mesh, views).vertices, mesh.vertices)
 
 
-def test_a_mesh_that_no_camera_shows_stays(views):
+def test_an_unseen_mesh_is_unchanged(views):
     mesh = ball(RADIUS)
     mesh = replace(mesh, vertices=mesh.vertices + 100.0)
     np.testing.assert_array_equal(moved_to_outlines(mesh, views).vertices, mesh.vertices)
@@ -141,7 +141,7 @@ def test_an_empty_mesh_stays_empty(views):
     assert moved_to_outlines(empty, views) is empty
 
 
-def test_the_same_bits_for_any_number_of_threads(views, few_threads):
+def test_results_do_not_depend_on_threads(views, few_threads):
     mesh = ball(RADIUS - 0.2 * FOOTPRINT)
     found = moved_to_outlines(mesh, views).vertices
     ops.set_threads(3)

@@ -1,5 +1,4 @@
-"""Where photographs agree best along the normals of a mesh, against a textured plane whose photographs are known
-exactly."""
+"""Photo-consistency along the normals of a mesh, tested with exact photographs of a textured plane."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ def predicted(mesh, shown):
     return predicted_error(mesh, [s.camera for s in shown], (s.load() for s in shown))
 
 
-def test_exposures_are_found_on_a_wrong_surface_and_taken_out():
+def test_exposure_gains_are_found_on_an_inaccurate_surface():
     true = np.exp(0.25 * np.cos(2.3 * np.arange(8)))
     true /= np.exp(np.log(true).mean())
     views = ring()
@@ -53,12 +52,12 @@ def test_exposures_are_found_on_a_wrong_surface_and_taken_out():
     moved = refine_surface(mesh, drifting, 2, gains)
     left = np.abs(refine_surface(mesh, drifting, 2).vertices[middle, 2]).mean()
     assert np.abs(moved.vertices[middle, 2]).mean() < 0.3 * np.abs(mesh.vertices[middle, 2]).mean() < left
-    apart = [camera((100.0 * k, 0.0, DISTANCE)) for k in range(2)]  # the second sees nothing of it
+    apart = [camera((100.0 * k, 0.0, DISTANCE)) for k in range(2)]  # the second camera does not see the mesh
     assert photo_gains(mesh, apart, (Shown(view).load() for view in apart)).tolist() == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("height", [-1.5, -0.6, 0.0, 0.4, 1.2])
-def test_the_best_place_is_the_plane(shown, height):
+def test_the_best_agreement_is_at_the_true_plane(shown, height):
     mesh = sheet(lambda x, y: np.full_like(x, height * FOOTPRINT))
     found, middle = agreement(mesh, shown), inner(mesh)
     assert found.seen_by_two[middle].all() and found.inside[middle].mean() > 0.99
@@ -66,16 +65,16 @@ def test_the_best_place_is_the_plane(shown, height):
     assert (np.abs(found.offset[middle] + height * FOOTPRINT) < 0.5 * FOOTPRINT).mean() > 0.95
 
 
-def test_the_predicted_error_is_the_true_one(shown):
+def test_predicted_errors_agree_with_true_ones(shown):
     mesh = sheet(lambda x, y: 1.2 * FOOTPRINT * np.sin(6 * x))
     middle = inner(mesh)
     told, truth = predicted(mesh, shown)[middle], np.abs(mesh.vertices[middle, 2])
-    # The waves repeat, so a few vertices agree best with the next one.
+    # The texture repeats, so a few vertices agree best one period away.
     assert np.median(np.abs(told - truth)) < 0.1 * FOOTPRINT
     assert told.mean() == pytest.approx(truth.mean(), rel=0.15)
 
 
-def test_plain_surfaces_are_less_certain():
+def test_predicted_errors_grow_with_falling_contrast():
     mesh = sheet(lambda x, y: np.zeros_like(x))
     middle, before = inner(mesh), 0.0
     for contrast in (0.1, 0.03, 0.01):
@@ -84,7 +83,7 @@ def test_plain_surfaces_are_less_certain():
         told = np.median(predicted(mesh, faint)[middle])
         assert max(before, 0.5 * actual) < told < 3 * actual
         before = told
-    # Where photographs say nothing, only what is expected before they are asked is left.
+    # Without texture the predicted error is that of the prior.
     plain = [Shown(view, lambda x, y: np.full_like(x, 0.5)) for view in ring()]
     footprint = photo_consistency._footprints(*photo_consistency._points(mesh), [s.camera for s in plain])[middle]
     scale, place = photo_consistency.PRIOR_SCALE, np.linspace(0, 3, 10_001)
@@ -93,7 +92,7 @@ def test_plain_surfaces_are_less_certain():
     assert predicted(mesh, plain)[middle] == pytest.approx(scale * footprint, rel=0.05)
 
 
-def test_slivers_are_swept_along_the_surface_normal():
+def test_search_directions_are_smoother_than_vertex_normals():
     random = np.random.default_rng(0)
     mesh = sheet(lambda x, y: np.zeros_like(x))
     jitter = random.normal(size=mesh.vertices.shape) * [0.3, 0.3, 0.1] * (mesh.vertices[1, 1] - mesh.vertices[0, 1])
@@ -105,7 +104,7 @@ def test_slivers_are_swept_along_the_surface_normal():
     assert tilt < 0.5 * own
 
 
-def test_rounds_bring_the_surface_to_the_plane(shown):
+def test_refinement_converges_to_the_plane(shown):
     mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x) * np.cos(5 * y))
     middle = inner(mesh)
     errors = [np.abs(refine_surface(mesh, shown, rounds).vertices[middle, 2]).mean() for rounds in (0, 1, 2)]
@@ -114,14 +113,14 @@ def test_rounds_bring_the_surface_to_the_plane(shown):
     assert (again.faces == mesh.faces).all() and np.allclose(again.normals, vertex_normals(again))
 
 
-def test_a_plain_surface_stays_where_it_is():
+def test_a_textureless_surface_is_not_moved():
     plain = [Shown(view, lambda x, y: np.full_like(x, 0.5)) for view in ring()]
     mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x))
     moved = refine_surface(mesh, plain, 2)
     assert np.abs(moved.vertices - mesh.vertices).max() < 0.01 * FOOTPRINT
 
 
-def test_exposure_does_not_move_the_best_place(shown):
+def test_exposure_does_not_shift_the_best_agreement(shown):
     mesh = sheet(lambda x, y: np.full_like(x, 0.8 * FOOTPRINT))
     gains = np.linspace(0.8, 1.2, len(shown))
     drifted = [Shown(s.camera, lambda x, y, g=g: g * texture(x, y)) for s, g in zip(shown, gains, strict=True)]
@@ -129,7 +128,7 @@ def test_exposure_does_not_move_the_best_place(shown):
     assert np.median(found.offset[middle]) == pytest.approx(-0.8 * FOOTPRINT, abs=0.2 * FOOTPRINT)
 
 
-def test_vertices_that_fewer_than_two_photographs_see_take_that_of_the_nearest(shown):
+def test_hidden_vertices_take_the_predicted_error_of_the_nearest(shown):
     mesh = sheet(lambda x, y: np.full_like(x, 0.8 * FOOTPRINT))
     above = mesh.vertices + [0, 0, 0.5]
     below = Mesh(np.concatenate([mesh.vertices, above]), np.concatenate([mesh.faces, mesh.faces + len(above)]))
@@ -145,20 +144,20 @@ def test_vertices_that_fewer_than_two_photographs_see_take_that_of_the_nearest(s
                 : photo_consistency.NEIGHBOURS
             ]
         ]
-        assert told[row] == pytest.approx(told[nearest].mean(), rel=0.05)  # others are as near
+        assert told[row] == pytest.approx(told[nearest].mean(), rel=0.05)  # ties among the nearest
     assert np.isnan(predicted(mesh, shown[:1])).all()
     assert (refine_surface(mesh, shown[:1], 1).vertices == mesh.vertices).all()
 
 
-def test_a_transparent_photograph_counts_as_grey(shown):
+def test_transparent_photographs_give_no_sharpness(shown):
     mesh = sheet(lambda x, y: np.full_like(x, 0.5 * FOOTPRINT))
     clear = [replace(s.photo, alpha=np.zeros((SIZE, SIZE), np.uint8)) for s in shown]
     found = best_agreement(mesh, [s.camera for s in shown], clear)
     assert found.seen_by_two[inner(mesh)].all() and found.sharpness.max() < 1e-3
 
 
-def test_the_core_adds_what_the_formulas_say(shown):
-    """Float64 numpy, from the definition."""
+def test_add_photo_agrees_with_numpy(shown):
+    """Compare with the definition in float64 numpy."""
     mesh = sheet(lambda x, y: 0.3 * FOOTPRINT * np.sin(9 * y), steps=9)
     footprint, normals = np.full(len(mesh.vertices), FOOTPRINT), photo_consistency._points(mesh)[1]
     found = agreement(mesh, shown)
@@ -192,15 +191,15 @@ def test_the_core_adds_what_the_formulas_say(shown):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 40.0, 70.0])
-def test_how_far_behind_the_surface_and_beside_a_jump_a_point_is_seen(tilt):
-    """At depth z, focal length f and a slope of t from one pixel to the next, up to z (1 + tan t) / f behind, and where
-    the depth jumps by up to 4 times as much."""
+def test_visibility_tolerances_behind_surfaces_and_beside_jumps(tilt):
+    """A point may lie up to z (1 + tan t) / f behind the surface, for depth z, tilt t and focal length f. Depths may
+    jump by up to 4 times as much."""
     focal, size, outline = 100.0, 9, 4.0
     angle, pose, lens = np.radians(tilt), np.eye(4)[:3], (focal, focal, size / 2, size / 2)
     normal = np.array([[np.sin(angle), 0.0, -np.cos(angle)]])
 
     def seen(depth, jump):
-        """Whether a point 2 before the camera is, with the surface `depth` before it."""
+        """Whether a point at depth 2 counts as visible, with the surface at `depth`."""
         image, depths, jumps = (np.full((size, size), x, np.float32) for x in (0.5, depth, jump))
         views, weight, sums = np.zeros(1, np.int32), np.zeros(1, np.float32), np.zeros((2, 1, 1), np.float32)
         point, one, here = np.array([[0.0, 0.0, 2.0]]), np.ones(1), np.zeros(1)
@@ -215,9 +214,9 @@ def test_how_far_behind_the_surface_and_beside_a_jump_a_point_is_seen(tilt):
     assert seen(2, 0.99 * outline * slope) and not seen(2, 1.01 * outline * slope)
 
 
-def test_a_footprint_is_what_a_pixel_covers_of_the_surface():
-    """z / (f cos t) for a surface that leans by t, f the geometric mean of both focal lengths; the least of all views
-    under less than 81 degrees."""
+def test_footprints_agree_with_the_closed_form():
+    """The footprint is z / (f cos t), with tilt t and the geometric mean f of the focal lengths: the least over views
+    with a tilt below 81 degrees."""
     angle = np.radians([0.0, 30.0, 60.0, 81.0, 82.0])
     point, lens = np.tile([0.0, 0.0, 2.0], (5, 1)), (80.0, 125.0, 5.0, 5.0)
     normal = np.stack([np.sin(angle), np.zeros(5), -np.cos(angle)], 1)
@@ -229,8 +228,8 @@ def test_a_footprint_is_what_a_pixel_covers_of_the_surface():
     assert least == pytest.approx([*(2 / (100 * np.cos(angle[:4]))), 9.0], rel=1e-12)
 
 
-def test_the_largest_footprints_are_cut_though_some_vertices_are_not_seen():
-    """Of a sheet before one camera: one vertex leans away by 80 degrees, one faces away."""
+def test_large_and_unknown_footprints_are_limited():
+    """One vertex of a sheet in front of the camera is tilted by 80 degrees, one faces away."""
     mesh, view = sheet(lambda x, y: np.zeros_like(x), steps=9), camera((0.0, 0.0, DISTANCE))
     normals = np.tile([0.0, 0.0, 1.0], (len(mesh.vertices), 1))
     normals[40], normals[41] = [np.sin(np.radians(80)), 0, np.cos(np.radians(80))], [0, 0, -1]
@@ -240,7 +239,7 @@ def test_the_largest_footprints_are_cut_though_some_vertices_are_not_seen():
     assert others == pytest.approx(np.full(len(others), FOOTPRINT), rel=0.05)
 
 
-def test_a_mean_over_neighbours_counts_each_of_them_once():
+def test_neighbour_average_counts_each_neighbour_once():
     mesh = sheet(lambda x, y: np.zeros_like(x), steps=4)
     values = np.random.default_rng(0).normal(size=len(mesh.vertices))
     found = photo_consistency.neighbour_average(mesh) @ values
@@ -249,7 +248,7 @@ def test_a_mean_over_neighbours_counts_each_of_them_once():
         assert found[vertex] == pytest.approx(values[around].mean(), abs=1e-12)
 
 
-def test_the_same_bytes_at_any_number_of_threads(shown, few_threads):
+def test_results_do_not_depend_on_threads(shown, few_threads):
     mesh = sheet(lambda x, y: FOOTPRINT * np.sin(6 * x))
     one = agreement(mesh, shown)
     ops.set_threads(3)

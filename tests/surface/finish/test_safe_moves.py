@@ -1,4 +1,4 @@
-"""Moves that fold nothing over and push nothing through another."""
+"""Vertex moves that flip no faces and cause no self-intersections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from linprim_geo.surface.finish.self_intersections import crossings
 from linprim_geo.surface.normals import vertex_normals
 
 
-def test_moves_that_do_no_harm_are_made():
+def test_harmless_moves_are_applied():
     ball = sphere(rounds=4)
     wanted = ball.vertices * 1.1 + [0.2, 0, 0]
     found = moved_safely(ball, wanted)
@@ -22,7 +22,7 @@ def test_moves_that_do_no_harm_are_made():
     assert np.abs(found.normals - ball.vertices).max() < 0.01
 
 
-def test_two_sheets_that_would_cross_stay_apart():
+def test_moves_that_make_sheets_cross_are_undone():
     lower = sheet(lambda x, y: 0 * x)
     upper = replace(lower, vertices=lower.vertices + [0.003, 0.002, 0.01])
     mesh = join(lower, upper)
@@ -32,12 +32,12 @@ def test_two_sheets_that_would_cross_stay_apart():
     found = moved_safely(mesh, wanted)
     assert len(crossings(found)[0]) == 0
     assert np.mean(np.isclose(found.vertices, wanted).all(1)) > 0.2
-    # What would go through the other sheet does not move at all.
+    # Vertices whose faces would cross the other sheet do not move.
     pierced = mesh.faces[np.unique(crossings(replace(mesh, vertices=wanted))[0])]
     assert np.array_equal(found.vertices[pierced], mesh.vertices[pierced])
 
 
-def test_crossings_that_there_were_may_stay_and_what_is_apart_moves():
+def test_existing_crossings_do_not_block_other_parts():
     knot, far = join(sphere(), sphere(center=(1.0, 0.1, 0.2))), sphere(center=(9.0, 0, 0))
     mesh = join(knot, far)
     wanted = mesh.vertices + [0, 0, 0.01]
@@ -45,24 +45,24 @@ def test_crossings_that_there_were_may_stay_and_what_is_apart_moves():
     assert np.allclose(found.vertices[-len(far.vertices) :], wanted[-len(far.vertices) :], rtol=0, atol=1e-12)
 
 
-def test_a_vertex_that_would_fold_its_faces_over_goes_part_of_the_way():
+def test_a_move_that_would_flip_faces_is_shortened():
     mesh = sheet(lambda x, y: 0 * x, steps=9)
     middle = np.abs(mesh.vertices).max(1).argmin()
     wanted = mesh.vertices.copy()
-    wanted[middle, 0] += 0.2  # past its neighbour, 0.125 away
+    wanted[middle, 0] += 0.2  # beyond its neighbour at a distance of 0.125
     folded = (face_normals(replace(mesh, vertices=wanted))[:, 2] < 0).sum()
     found = moved_safely(mesh, wanted)
     assert folded > 0 and (face_normals(found)[:, 2] > 0).all()
     assert 0 < found.vertices[middle, 0] < 0.125
 
 
-def test_nothing_to_move_is_no_trouble():
+def test_no_move_leaves_the_mesh_unchanged():
     mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
     assert np.array_equal(moved_safely(mesh, mesh.vertices).vertices, mesh.vertices)
 
 
-def test_what_goes_through_itself_is_smoothed_until_it_does_not():
-    """A sheet of noise before another one, of which a spike comes through the other."""
+def test_untangle_removes_crossings_by_local_smoothing():
+    """A spike of a noisy sheet pierces the sheet below it."""
     rng = np.random.default_rng(0)
     lower, upper = sheet(lambda x, y: 0 * x), sheet(lambda x, y: 0.03 + 0 * x)
     rough = upper.vertices + np.outer(rng.uniform(-0.005, 0.005, len(upper.vertices)), [0, 0, 1])
@@ -77,12 +77,12 @@ def test_what_goes_through_itself_is_smoothed_until_it_does_not():
     assert np.allclose(found.normals, vertex_normals(found))
 
 
-def test_what_does_not_go_through_itself_stays_as_it_is():
+def test_untangle_keeps_meshes_without_crossings():
     ball = sphere(rounds=4)
     assert np.array_equal(untangled(ball).vertices, ball.vertices)
 
 
-def test_sheets_of_noise_through_each_other_have_fewer_places_where_they_are():
+def test_untangle_reduces_crossings_of_noisy_sheets():
     lower = sheet(lambda x, y: 0 * x)
     mesh = join(lower, replace(lower, vertices=lower.vertices + [0.003, 0.002, 0.004]))
     rng = np.random.default_rng(0)

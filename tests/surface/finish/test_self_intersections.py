@@ -1,4 +1,4 @@
-"""Faces that edges go through, against all pairs in exact numbers."""
+"""Faces pierced by edges, compared with all pairs in exact arithmetic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from linprim_geo.surface.finish.self_intersections import crossings, edges_of
 
 
 def by_all_pairs(mesh: Mesh) -> list[int]:
-    """Each face against each edge, in fractions."""
+    """Test each face against each edge with fractions."""
     corners = [[Fraction(float(x)) for x in vertex] for vertex in mesh.vertices]
 
     def volume(*rows: int) -> Fraction:
@@ -38,20 +38,20 @@ def by_all_pairs(mesh: Mesh) -> list[int]:
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
-def test_a_soup_of_triangles_as_by_all_pairs(scale):
+def test_random_triangles_agree_with_all_pairs(scale):
     vertices = scale * np.random.default_rng(3).normal(size=(60, 3))
     mesh = Mesh(vertices, np.arange(60).reshape(-1, 3))
     expected = by_all_pairs(mesh)
     assert 5 < len(expected) < 20 and np.unique(crossings(mesh)[0]).tolist() == expected
 
 
-def test_two_spheres_that_overlap_as_by_all_pairs():
+def test_overlapping_spheres_agree_with_all_pairs():
     mesh = join(sphere(rounds=2), sphere(rounds=2, center=(0.9, 0.31, 0.17)))
     expected = by_all_pairs(mesh)
     assert len(expected) > 10 and np.unique(crossings(mesh)[0]).tolist() == expected
 
 
-def test_a_fold_over_itself_is_found_though_neighbours_share_its_vertices():
+def test_a_fold_agrees_with_all_pairs():
     mesh = grid(6, 6, size=(1.0, 1.0))
     middle = np.flatnonzero(np.abs(mesh.vertices[:, :2] - 0.5).max(1) < 0.01)[0]
     folded = mesh.vertices.copy()
@@ -63,13 +63,13 @@ def test_a_fold_over_itself_is_found_though_neighbours_share_its_vertices():
 
 
 @pytest.mark.parametrize("mesh", [sphere(rounds=4), grid(30, 20), join(grid(), grid(height=1e-3))])
-def test_a_surface_that_is_simple_has_none(mesh):
+def test_simple_surfaces_have_no_crossings(mesh):
     assert len(crossings(mesh)[0]) == 0
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e4])
-def test_faces_that_lie_over_each_other_in_one_plane_do_not_count(offset):
-    """In coordinates of float64 a tilted plane is none: what overlaps in it crosses by a rounding."""
+def test_coplanar_overlapping_faces_do_not_count(offset):
+    """Points of a tilted plane are rounded in float64, so overlapping faces cross by rounding errors."""
     rng = np.random.default_rng(5)
     across = np.linalg.qr(rng.normal(size=(3, 3)))[0][:2]
     mesh = Mesh(offset + rng.uniform(-1, 1, (300, 2)) @ across, np.arange(300).reshape(-1, 3))
@@ -78,7 +78,7 @@ def test_faces_that_lie_over_each_other_in_one_plane_do_not_count(offset):
     assert len(crossings(replace(mesh, vertices=lifted))[0]) > 100
 
 
-def test_pairs_are_in_order_and_the_same_for_any_number_of_threads():
+def test_pairs_are_sorted_and_do_not_depend_on_threads():
     mesh = join(sphere(rounds=5), sphere(rounds=5, center=(0.9, 0.31, 0.17)))
     edges, before = edges_of(mesh.faces), ops.threads()
     try:
@@ -95,7 +95,7 @@ def test_pairs_are_in_order_and_the_same_for_any_number_of_threads():
     assert len(pairs) > 100 and pairs == sorted(set(pairs))
 
 
-def test_edges_that_are_asked_alone_count():
+def test_only_the_given_edges_are_tested():
     mesh = join(sphere(rounds=2), sphere(rounds=2, center=(0.9, 0.31, 0.17)))
     face, ends = crossings(mesh)
     some = np.unique(ends, axis=0)[::2]

@@ -1,4 +1,4 @@
-"""Holes that a window of stereo covers are closed, but for those that photographs see through."""
+"""Holes no wider than a stereo window are closed, unless photographs see through them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ NOT_FREE = [np.zeros((100, 100), bool) for _ in CAMERAS]
 
 
 def flat(steps: int = 101) -> Mesh:
-    """With edges of a pixel."""
+    """A flat sheet whose edges are one pixel long."""
     return sheet(lambda x, y: 0 * x, steps=steps)
 
 
 def pierced(mesh: Mesh, radius: float, middle=(0.0, 0.0)) -> Mesh:
-    """Without the faces whose middles are that near to a point."""
+    """Remove faces whose centres lie within `radius` of `middle`."""
     away = np.linalg.norm(mesh.vertices[mesh.faces].mean(1)[:, :2] - middle, axis=1)
     return select_faces(mesh, away > radius)
 
@@ -40,19 +40,19 @@ def outer_edges() -> int:
     return topology(flat())["boundary_edges"]
 
 
-def test_a_hole_as_wide_as_a_window_is_closed_and_nothing_else_changes():
+def test_a_small_hole_is_closed_without_other_changes():
     holed = replace(pierced(flat(), 0.04), quality=np.linspace(1, 2, len(pierced(flat(), 0.04).vertices)))
     found, holes = closed(holed)
     assert holes == 1 and topology(holed)["boundary_edges"] > outer_edges() == topology(found)["boundary_edges"]
     np.testing.assert_array_equal(found.vertices, holed.vertices)
     np.testing.assert_array_equal(found.quality, holed.quality)
     np.testing.assert_array_equal(found.faces[: len(holed.faces)], holed.faces)
-    assert topology(found)["area"] == pytest.approx(topology(flat())["area"])  # every patch faces up: none overlaps
+    assert topology(found)["area"] == pytest.approx(topology(flat())["area"])  # patches face up without overlap
     assert topology(found)["non_manifold_edges"] == 0
 
 
-@pytest.mark.parametrize("seed", range(1, 7))  # of 0 a triangle hangs into the hole by one corner
-def test_patches_of_holes_of_any_shape_do_not_overlap(seed):
+@pytest.mark.parametrize("seed", range(1, 7))  # seed 0 leaves a triangle connected by one vertex only
+def test_patches_of_irregular_holes_do_not_overlap(seed):
     middle = flat().vertices[flat().faces].mean(1)
     away, angle = np.linalg.norm(middle[:, :2], axis=1), np.arctan2(middle[:, 1], middle[:, 0])
     knots = np.random.default_rng(seed).uniform(0.01, 0.045, 12)
@@ -66,19 +66,19 @@ def test_patches_of_holes_of_any_shape_do_not_overlap(seed):
         assert topology(found)["area"] == pytest.approx(1) and normal[:, 2].min() > -1e-12
 
 
-def test_a_wider_hole_stays():
+def test_a_hole_wider_than_a_window_stays():
     radius = WINDOW * 0.01 / 2
     assert closed(pierced(flat(), radius - 0.015))[1] == 1
     wide = pierced(flat(), radius + 0.015)
     found, holes = closed(wide)
     assert holes == 0 and found is wide
-    # Nor where no camera tells how wide it is.
+    # Holes that no camera sees stay, too.
     away = [look_at((0, 0, -2.0), (0, 0, -4.0), (100, 100), 200.0, (0.0, 1.0, 0.0))]
     assert without_small_holes(pierced(flat(), 0.02), away, UNKNOWN[:1], NOT_FREE[:1])[1] == 0
 
 
 @pytest.mark.parametrize("angle", [0, 30, 45])
-def test_a_slit_is_as_wide_as_it_is_across(angle):
+def test_the_width_of_a_slit_is_measured_across_it(angle):
     mesh, turned = flat(), np.radians(angle)
     middle = mesh.vertices[mesh.faces].mean(1)[:, :2]
     along = middle @ np.array([np.cos(turned), np.sin(turned)])
@@ -91,7 +91,7 @@ def test_a_slit_is_as_wide_as_it_is_across(angle):
 
 
 def slit_from_the_border(width: float, depth: float) -> Mesh:
-    """A sheet with a slit of so many pixels that begins at its border, turns by a right angle and ends inside."""
+    """A sheet with a slit, in pixels, that begins at its border, turns by 90 degrees and ends inside."""
     x, y = (flat().vertices[flat().faces].mean(1)[:, k] for k in (0, 1))
     half = width * 0.01 / 2
     down = (np.abs(x) < half) & (y > 0.5 - depth * 0.01 - half)
@@ -103,7 +103,7 @@ def area(mesh: Mesh) -> float:
     return topology(mesh)["area"]
 
 
-def test_a_slit_that_runs_into_the_border_and_turns_is_closed():
+def test_a_bent_slit_open_to_the_border_is_closed():
     slit = slit_from_the_border(WINDOW - 4, 40)
     found, holes = closed(slit)
     assert holes == 0 and area(slit) < 0.95 < area(found) == pytest.approx(1)
@@ -146,7 +146,7 @@ def test_two_views_that_see_through_a_hole_keep_it_open(views, holes, is_free):
     assert closed(pierced(flat(), 0.04), behind, free)[1] == holes
 
 
-def test_what_views_know_before_or_at_a_hole_does_not_keep_it_open():
+def test_depths_in_front_of_or_at_a_hole_do_not_keep_it_open():
     for depth in (1.5, 2.0):
         assert closed(pierced(flat(), 0.04), [np.full((100, 100), depth) for _ in CAMERAS])[1] == 1
 
@@ -167,14 +167,14 @@ def test_holes_that_touch_in_a_vertex_are_closed():
     assert holes >= 1 and topology(found)["boundary_edges"] == outer_edges()
 
 
-def test_a_hole_with_something_in_the_way_stays():
+def test_a_hole_with_a_face_through_it_stays():
     thorn = Mesh(np.array([[0.0, 0, -0.1], [0.005, 0, 0.1], [-0.005, 0, 0.1]]), np.array([[0, 1, 2]]))
     holed = join(pierced(flat(), 0.04), thorn)
     found, holes = closed(holed)
     assert holes == 0 and len(crossings(found)[0]) == 0
 
 
-def test_a_closed_surface_and_an_empty_one_stay():
+def test_closed_and_empty_meshes_are_unchanged():
     corners = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
     solid = Mesh(corners, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))

@@ -1,4 +1,4 @@
-"""Simplification within a tolerance: nothing that is gone is farther away than was allowed."""
+"""Simplification within a tolerance of the distance from removed vertices to the new surface."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ def square(steps: int, side: float) -> Mesh:
 
 
 def welded(mesh: Mesh) -> Mesh:
-    """With one vertex in place of those in one place."""
+    """Merge vertices with equal coordinates."""
     _, first, row = np.unique(np.round(mesh.vertices, 9), axis=0, return_index=True, return_inverse=True)
     return Mesh(mesh.vertices[first], row.reshape(-1)[mesh.faces])
 
 
 def cube(steps: int) -> Mesh:
-    """Closed, of side 2, each side of so many squares along an edge."""
+    """A closed cube of side 2 with `steps` squares along each edge."""
     side = square(steps, 2.0)
     x, y = (side.vertices[:, :2] - side.vertices[:, :2].mean(0)).T
     sides = []
@@ -51,7 +51,7 @@ def noisy(mesh: Mesh, deviation: float, seed: int = 0) -> Mesh:
 
 
 def least_angles(mesh: Mesh) -> np.ndarray:
-    """(F,) degrees."""
+    """(F,) smallest angle of each face in degrees."""
     corners = mesh.vertices[mesh.faces]
     sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
     ordered = np.sort(sides, axis=1)
@@ -69,7 +69,7 @@ def same_shape(one: Mesh, other: Mesh) -> bool:
     [noisy(sphere(rounds=4), 0.004), noisy(square(40, 2.0), 0.004), noisy(cube(20), 0.004)],
     ids=["sphere", "sheet", "cube"],
 )
-def test_what_is_gone_is_within_the_tolerance(mesh, tolerance):
+def test_removed_vertices_are_within_the_tolerance(mesh, tolerance):
     made = within_tolerance(mesh, tolerance)
     assert off(made, mesh.vertices).max() <= tolerance * (1 + 1e-9)
     assert same_shape(made, mesh) and len(made.faces) < len(mesh.faces)
@@ -93,14 +93,14 @@ def test_vertices_without_a_predicted_error_have_the_median():
     assert len(made.faces) < len(mesh.faces) and off(made, mesh.vertices).max() <= 0.005 * (1 + 1e-6)
 
 
-def test_flat_sides_become_two_faces_each_and_edges_stay_sharp():
+def test_flat_sides_become_two_faces_each():
     mesh = cube(24)
     made = within_tolerance(mesh, 1e-6)
     assert len(made.faces) == 12 and topology(made)["volume"] == pytest.approx(8.0, abs=24 * 1e-6)
     assert np.abs(made.vertices) == pytest.approx(np.ones((8, 3)), abs=2e-6)
 
 
-def test_edges_are_no_rounder_than_the_tolerance_where_sides_are_rough():
+def test_corners_of_a_rough_cube_stay_sharp():
     mesh = noisy(cube(24), 0.001)
     made = within_tolerance(mesh, 0.005)
     assert len(made.faces) < len(mesh.faces) / 50
@@ -108,8 +108,8 @@ def test_edges_are_no_rounder_than_the_tolerance_where_sides_are_rough():
     assert off(made, corners).max() < 0.008
 
 
-def test_a_sphere_has_as_many_faces_as_its_curve_asks_for():
-    """Chords of an arc are off by the square of their length, so faces are as many as tolerances fit in."""
+def test_number_of_faces_of_a_sphere_is_inverse_to_the_tolerance():
+    """The error of a chord grows with its squared length, so the number of faces is inverse to the tolerance."""
     mesh = sphere(rounds=6)
     counts = [len(within_tolerance(mesh, tolerance).faces) for tolerance in (0.001, 0.004, 0.016)]
     for fine, coarse in zip(counts, counts[1:], strict=False):
@@ -120,13 +120,13 @@ def test_a_sphere_has_as_many_faces_as_its_curve_asks_for():
     assert ideal < counts[0] < 3 * ideal
 
 
-def test_faces_are_no_slivers():
+def test_smallest_angles_are_above_10_degrees():
     angles = least_angles(within_tolerance(noisy(sphere(rounds=5), 0.0005), 0.003))
     assert angles.min() > 9.9 and np.median(angles) > 30
 
 
 def test_borders_stay_within_the_tolerance():
-    """A frame: with a hole in it, whose border may not grow over the hole nor shrink from it."""
+    """The border of the hole in a frame may neither grow nor shrink."""
     whole = square(60, 2.0)
     middle = whole.vertices[whole.faces].mean(1)[:, :2] - whole.vertices[:, :2].mean(0)
     frame = select_faces(whole, np.hypot(*middle.T) > 0.5)
@@ -138,8 +138,8 @@ def test_borders_stay_within_the_tolerance():
     assert off(frame, made.vertices[made.faces].mean(1)).max() < 0.02
 
 
-def test_holes_and_pieces_stay():
-    """However much is allowed: two balls, and a sheet with a hole of one face."""
+def test_holes_and_pieces_are_kept_at_any_tolerance():
+    """The tolerance is very large. The mesh has two balls, and a sheet with a hole of one face."""
     sheet = square(12, 2.0)
     mesh = join(sphere(rounds=3), sphere(center=(5.0, 0, 0), rounds=3), select_faces(sheet, np.arange(288) != 150))
     made = within_tolerance(mesh, 10.0)
@@ -147,7 +147,7 @@ def test_holes_and_pieces_stay():
     assert len(made.faces) < 40
 
 
-def test_what_touches_in_a_vertex_or_an_edge_stays_as_it_touches():
+def test_non_manifold_vertices_and_edges_are_kept():
     ball, other = sphere(rounds=3), sphere(rounds=3, center=(0, 0, 2.0))
     touching = welded(join(ball, other))
     made = within_tolerance(touching, 0.2)
@@ -163,7 +163,7 @@ def test_what_touches_in_a_vertex_or_an_edge_stays_as_it_touches():
     assert topology(within_tolerance(book, 0.1))["non_manifold_edges"] == 8
 
 
-def test_nothing_is_turned_inside_out():
+def test_no_face_is_turned_inside_out():
     mesh = noisy(sphere(rounds=5), 0.002)
     made = within_tolerance(mesh, 0.02)
     corners = made.vertices[made.faces]
@@ -172,7 +172,7 @@ def test_nothing_is_turned_inside_out():
     assert topology(made)["volume"] == pytest.approx(topology(mesh)["volume"], rel=0.03)
 
 
-def test_the_same_again_and_elsewhere():
+def test_results_are_reproducible_and_independent_of_position():
     mesh = noisy(sphere(rounds=4), 0.002)
     first, again = within_tolerance(mesh, 0.01), within_tolerance(mesh, 0.01)
     assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
@@ -180,7 +180,7 @@ def test_the_same_again_and_elsewhere():
     assert off(replace(far, vertices=far.vertices - [1e4, -2e4, 3e3]), mesh.vertices).max() < 0.01 + 1e-9
 
 
-def test_colours_and_quality_are_those_of_the_old_surface():
+def test_colours_and_quality_are_interpolated():
     mesh = sphere(rounds=5)
     share = (mesh.vertices + 1) / 2
     mesh = replace(mesh, colors=np.round(255 * share), quality=share[:, 0])
@@ -199,7 +199,7 @@ def test_colours_and_quality_are_those_of_the_old_surface():
         ([[0, 1, 2]], [1, np.nan, 1], "positive"),
     ],
 )
-def test_the_core_refuses_what_it_cannot_use(corner, tolerance, match):
+def test_invalid_arrays_are_refused(corner, tolerance, match):
     with pytest.raises(ValueError, match=match):
         surface_ops.simplify(np.array(corner), np.eye(3), np.array(tolerance, float))
 

@@ -31,24 +31,24 @@ def plane() -> Mesh:
 
 
 def frame(x: float, off: float, confidence: float = 1.0) -> DepthFrame:
-    """Depth of the plane, moved by `off` along its normal, from a camera at x."""
+    """Depths of the plane, shifted by `off` along its normal, from a camera at x."""
     camera = look_at((x, -DISTANCE, 0.1), (0.0, 0.0, 0.0), size=SIZE, focal=FOCAL)
     depth = (off - camera.center @ NORMAL) / (camera.world_rays() @ NORMAL)
     return DepthFrame(camera, depth.astype(np.float32), confidence=np.full(depth.shape, confidence, np.float32))
 
 
-def test_it_is_the_spread_of_the_depths_and_a_part_of_a_pixel():
+def test_error_combines_the_spread_of_depths_and_a_part_of_a_pixel():
     mesh, finest = plane(), FINEST * PIXEL
     exact = error_by_depths(mesh, [frame(x, 0.0) for x in (-0.4, 0.0, 0.4)], REACH)
     assert exact.dtype == np.float32 and exact == pytest.approx(finest, rel=0.3)
     noisy = error_by_depths(mesh, [frame(x, off) for x, off in ((-0.4, 0.1), (0.0, -0.1), (0.4, 0.1))], REACH)
     assert noisy == pytest.approx(np.hypot(exact, 0.1), rel=3e-3)
-    # Depths that count less move it less: (0.1^2 + 0.1^2 + 0.25 * 0.18^2) / 2.25.
+    # Weighted mean square: (0.1^2 + 0.1^2 + 0.25 * 0.18^2) / 2.25.
     weighted = [frame(-0.4, 0.1), frame(0.0, -0.1), frame(0.4, 0.18, confidence=0.25)]
     assert error_by_depths(mesh, weighted, REACH) == pytest.approx(np.hypot(exact, np.sqrt(0.0281 / 2.25)), rel=3e-3)
 
 
-def test_depths_that_had_no_part_in_the_surface_do_not_count():
+def test_unfused_depths_do_not_count():
     mesh = plane()
     exact = error_by_depths(mesh, [frame(x, 0.0) for x in (-0.4, 0.0)], REACH)
     nothing = frame(0.2, 0.0)
@@ -62,7 +62,7 @@ def test_depths_that_had_no_part_in_the_surface_do_not_count():
     assert error_by_depths(mesh, more, REACH) == pytest.approx(exact, rel=1e-6)
 
 
-def test_what_no_two_views_confirm_may_lie_anywhere_within_reach():
+def test_unconfirmed_vertices_have_the_largest_error():
     mesh = plane()
     for frames in ([frame(0.0, 0.0)], [frame(x, 0.0, confidence=0.1) for x in (-0.4, 0.0, 0.4)], []):
         assert (error_by_depths(mesh, frames, REACH) == np.float32(largest_error(REACH))).all()
@@ -72,7 +72,7 @@ def test_what_no_two_views_confirm_may_lie_anywhere_within_reach():
     assert (error_by_depths(mesh, apart, REACH) == np.float32(largest_error(REACH))).all(), "nothing is known either"
 
 
-def test_a_vertex_that_closes_a_hole_is_as_uncertain_as_it_is_far():
+def test_new_vertices_have_at_least_the_error_of_their_distance():
     mesh = replace(plane(), quality=np.linspace(0.01, 0.05, 144, dtype=np.float32))
     moved = mesh.vertices + 0.01 * NORMAL
     assert (error_of_nearest(mesh, moved) == mesh.quality).all()

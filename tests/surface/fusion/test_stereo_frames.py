@@ -1,4 +1,4 @@
-"""Depth maps of several sources as one, each by what it deserves, and what is supported of the surface made of them."""
+"""Depths of several sources merged with weights, and support of the surface that is fused from them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def rendered(error: float) -> list[DepthFrame]:
     return [DepthFrame(CAMERA, np.full((30, 40), 3.0 * (1 + error), np.float32), background=np.zeros((30, 40), bool))]
 
 
-def test_confirmed_depths_take_the_place_of_rendered_ones(found):
+def test_confirmed_depths_replace_rendered_ones(found):
     merged = MergedFrames(rendered(0.01), [VIEW], 5.0)
     frame = merged[0]
     assert (frame.depth[1:, :20] == 3).all() and np.allclose(frame.depth[0], 3.03)
@@ -58,7 +58,7 @@ def take_region_planes(monkeypatch, depth: np.ndarray, **where: np.ndarray) -> N
     monkeypatch.setattr(stereo_frames, "region_plane_depths", lambda *_: [laid])
 
 
-def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkeypatch):
+def test_region_planes_replace_confirmed_depths_that_are_not_sure(found, monkeypatch):
     found[0].confidence[:, 5:] = CONFIDENT
     take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
@@ -66,8 +66,8 @@ def test_planes_of_walls_stand_where_confirmed_depths_are_not_sure(found, monkey
     assert (frame.confidence[2:, :20] == 1).all()
 
 
-def test_walls_end_where_stereo_sees_it(found, monkeypatch):
-    """Not where planes of plain regions do, which reach to edges that may be others'."""
+def test_enclosing_planes_are_found_from_stereo_points_only(found, monkeypatch):
+    """Planes of plain regions are not used, as they may reach to edges of other surfaces."""
     asked = []
 
     def enclosing(cameras, planes, points, standing, known):
@@ -81,7 +81,7 @@ def test_walls_end_where_stereo_sees_it(found, monkeypatch):
     assert len(depth) and np.allclose(depth, 3)
 
 
-def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
+def test_region_planes_fill_unconfirmed_pixels(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[:, 10:30] = 3.5
     take_region_planes(monkeypatch, on_plane)
@@ -92,7 +92,7 @@ def test_planes_stand_where_nothing_is_confirmed(found, monkeypatch):
     assert (frame.confidence[:, 20:30] == 1).all() and np.allclose(frame.confidence[:, 30:], merged.weight)
 
 
-def test_sure_depths_are_moved_to_the_plane_of_their_region_where_it_says_so(found, monkeypatch):
+def test_sure_depths_marked_as_moved_take_the_region_plane(found, monkeypatch):
     moved = np.zeros((30, 40), bool)
     moved[:, 5:10] = True
     take_region_planes(monkeypatch, np.full((30, 40), 3.001, np.float32), moved=moved)
@@ -101,7 +101,7 @@ def test_sure_depths_are_moved_to_the_plane_of_their_region_where_it_says_so(fou
     assert (frame.depth[2:, :5] == 3).all() and (frame.depth[2:, 10:20] == 3).all()
 
 
-def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, monkeypatch):
+def test_confirmed_depths_near_a_point_plane_are_moved_to_it(found, monkeypatch):
     on_plane = np.full((30, 40), np.nan, np.float32)
     on_plane[5:, 10:30] = 3.001
     monkeypatch.setattr(stereo_frames, "point_plane_depth", lambda *_: on_plane)
@@ -110,8 +110,8 @@ def test_confirmed_depths_that_stereo_cannot_tell_from_a_plane_are_on_it(found, 
     assert (frame.depth[2:, :10] == 3).all() and (frame.depth[2:5, 10:20] == 3).all()
 
 
-def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_shading(found, monkeypatch):
-    """Planes by points, which are more precise, give way to another where that stands and is not doubted."""
+def test_precedence_of_planes_by_points_edges_and_shading(found, monkeypatch):
+    """Planes by points are replaced by another one only if that stands and is not doubted."""
     found[0].confidence[:] = CONFIDENT
     columns = np.arange(40)
     by_points, along_edges, by_shading = (np.full((30, 40), np.nan, np.float32) for _ in range(3))
@@ -127,8 +127,7 @@ def test_of_several_planes_that_of_a_regions_edges_stands_or_a_nearer_one_by_sha
     assert np.allclose(frame.depth, np.select([(columns < 10) | doubted, columns < 30], [3.001, 3.2], 3.1))
 
 
-def test_areas_of_shading_lie_on_the_planes_that_edges_tell(found, monkeypatch):
-    """But not in a background."""
+def test_shading_areas_receive_the_planes_of_edges_except_in_background(found, monkeypatch):
     along_edges, background = np.full((30, 40), np.nan, np.float32), np.zeros((30, 40), bool)
     along_edges[:, :20] = 3.2
     background[:, :5] = True
@@ -141,7 +140,7 @@ def test_areas_of_shading_lie_on_the_planes_that_edges_tell(found, monkeypatch):
     assert all((number[:, 5:20] == 0).all() and (np.delete(number, np.s_[5:20], 1) == -1).all() for number in told)
 
 
-def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found, monkeypatch):
+def test_spans_fill_unknown_pixels_without_edges(found, monkeypatch):
     edge = np.zeros((30, 40), bool)
     edge[:, 30:] = True
     monkeypatch.setattr(stereo_frames, "spanned_depths", lambda *_: [np.full((30, 40), 3.2, np.float32)])
@@ -155,7 +154,7 @@ def test_spans_stand_where_nothing_is_known_and_photographs_have_no_edges(found,
     assert merged.spanned == 0.75 and merged.about()["spanned"] == 0.75
 
 
-def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_is_rendered(found, monkeypatch):
+def test_enclosing_planes_fill_unknown_pixels_without_sharp_rendering(found, monkeypatch):
     sharp = np.zeros((30, 40), bool)
     sharp[:, 30:] = True
     asked, doubted = [], []
@@ -181,7 +180,7 @@ def test_rays_end_at_enclosing_planes_where_nothing_is_known_and_nothing_sharp_i
     assert uncertain.any() and (doubted[0][uncertain] == found[0].depth[uncertain]).all()
 
 
-def test_plain_regions_lie_on_walls_whatever_is_rendered_or_doubted_there_but_background(found, monkeypatch):
+def test_wall_regions_replace_rendered_and_doubtful_depths_except_in_background(found, monkeypatch):
     on_wall, background = np.full((30, 40), np.nan, np.float32), np.zeros((30, 40), bool)
     on_wall[:2, :] = 3.4
     background[:, 35:] = True
@@ -204,7 +203,7 @@ def test_plain_regions_lie_on_walls_whatever_is_rendered_or_doubted_there_but_ba
 
 
 @pytest.mark.parametrize("plane, taken", [(2.5, 2.5), (3.1, 3.1), (3.2, 3)])
-def test_doubtful_depths_stay_where_they_are_well_before_an_enclosing_plane(found, monkeypatch, plane, taken):
+def test_doubtful_depths_well_in_front_of_an_enclosing_plane_stay(found, monkeypatch, plane, taken):
     monkeypatch.setattr(
         stereo_frames,
         "enclosing_depths",
@@ -216,7 +215,7 @@ def test_doubtful_depths_stay_where_they_are_well_before_an_enclosing_plane(foun
     assert (merged[0].depth[found[0].is_confirmed()] == 3).all()
 
 
-def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
+def test_enclosing_planes_do_not_fill_background(found, monkeypatch):
     background = np.zeros((30, 40), bool)
     background[:, 25:] = True
     monkeypatch.setattr(stereo_frames.ShadedPlanes, "is_background", lambda *_: background)
@@ -230,7 +229,7 @@ def test_no_ray_ends_at_an_enclosing_plane_in_background(found, monkeypatch):
     assert np.allclose(frame.depth[:, 20:25], 3.4) and (frame.depth[:, 25:] == 0).all()
 
 
-def test_rays_are_free_where_shading_says_background_whatever_stereo_and_training_say(found, monkeypatch):
+def test_background_by_shading_overrides_stereo_and_rendering(found, monkeypatch):
     background = np.zeros((30, 40), bool)
     background[:, 10:] = True
     found[0].grey[:, 12:] = 200
@@ -247,7 +246,7 @@ def test_rays_are_free_where_shading_says_background_whatever_stereo_and_trainin
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_no_ray_goes_on_where_shading_says_wall_unless_masks_say_so(found, monkeypatch, masked):
+def test_walls_by_shading_are_no_background_without_masks(found, monkeypatch, masked):
     wall, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     wall[:, :5], background[:, :10] = True, True
     asked = []
@@ -267,7 +266,7 @@ def test_no_ray_goes_on_where_shading_says_wall_unless_masks_say_so(found, monke
         assert (frame.depth[2:, :5] == 3).all() and (frame.depth[0, :5] == 3.5).all()
 
 
-def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
+def test_known_depths_on_enclosing_planes_are_no_background(found, monkeypatch):
     on_plane, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     on_plane[:, :5], background[:, :10] = True, True
     asked = []
@@ -286,7 +285,7 @@ def test_what_few_views_know_on_a_plane_is_not_background(found, monkeypatch):
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_rays_end_at_confirmed_depths_in_lone_backgrounds_unless_masks_say_so(found, monkeypatch, masked):
+def test_lone_backgrounds_take_confirmed_depths_without_masks(found, monkeypatch, masked):
     hole, background = np.zeros((30, 40), bool), np.zeros((30, 40), bool)
     hole[:, :5], background[:, :10] = True, True
     asked = []
@@ -305,7 +304,7 @@ def test_rays_end_at_confirmed_depths_in_lone_backgrounds_unless_masks_say_so(fo
         assert (asked[0] == background).all() and np.isfinite(asked[1][2:, :20]).all()
 
 
-def test_thin_things_stand_before_what_is_known(found, monkeypatch):
+def test_rendered_thin_things_replace_known_depths(found, monkeypatch):
     thing = np.zeros((30, 40), bool)
     thing[:, 7:9] = True
     asked = []
@@ -323,30 +322,30 @@ def test_thin_things_stand_before_what_is_known(found, monkeypatch):
     assert (frame.depth[2:, :7] == 3).all() and (frame.depth[2:, 9:20] == 3).all()
     assert merged.thin == merged.about()["thin"] == pytest.approx(2 / 40)
     (view,) = asked
-    # What is known is of all sources, confirmed ones first.
+    # Known depths come from all sources, confirmed ones first.
     assert (view.known[2:, :20] == 3).all() and (view.known[:, 20:] == 3.5).all() and view.sharp.all()
-    # It is supported where it is taken.
+    # Rendered depths of thin things count as support.
     middle = CAMERA.center + CAMERA.world_rays()[15, 7] * 2.7
     assert merged.supporting(middle[None]) == [1]
 
 
-def test_things_that_are_known_by_their_outlines_are_as_rendered(found, monkeypatch):
+def test_rendered_depths_bounded_by_silhouettes_replace_differing_ones(found, monkeypatch):
     thing = np.zeros((30, 40), bool)
     thing[4:20, 15:25] = True
     monkeypatch.setattr(stereo_frames, "silhouette_bounded", lambda views: [thing])
     take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32))
     merged = MergedFrames(rendered(0.02), [VIEW], 5.0)
     frame = merged[0]
-    # In place of confirmed depths of the left half and of a plane in the right one.
+    # They replace confirmed depths in the left half and a plane in the right half.
     assert np.allclose(frame.depth[thing], 3.06) and (frame.confidence[thing] == 1).all()
     assert (frame.depth[2:, :15] == 3).all() and (frame.depth[2:, 25:] == 3.5).all()
     assert merged.outlined == merged.about()["outlined"] == pytest.approx(160 / 1200) and merged.thin == 0
-    # Confirmed depths that say the same stay.
+    # Confirmed depths that agree stay.
     frame = MergedFrames(rendered(0.005), [VIEW], 5.0)[0]
     assert (frame.depth[4:20, 15:20] == 3).all() and np.allclose(frame.depth[4:20, 20:25], 3.015)
 
 
-def test_planes_that_nothing_shows_count_as_doubtful(found, monkeypatch):
+def test_doubted_planes_have_the_weight_of_doubtful_depths(found, monkeypatch):
     doubted = np.zeros((30, 40), bool)
     doubted[:, 15:25] = True
     take_region_planes(monkeypatch, np.full((30, 40), 3.5, np.float32), doubted=doubted)
@@ -360,8 +359,8 @@ def test_planes_that_nothing_shows_count_as_doubtful(found, monkeypatch):
     ("confirming", "of_all", "of_edge", "flap_stays"),
     [(2, False, True, False), (1, False, True, False), (2, True, True, True), (2, False, False, True)],
 )
-def test_depths_of_edges_that_others_see_through_are_not_fused(monkeypatch, confirming, of_all, of_edge, flap_stays):
-    """Beside a board 1 before a wall, 3 away, in the first of five views or in all; confirmed or doubtful."""
+def test_depths_beside_edges_seen_through_by_others_are_not_fused(monkeypatch, confirming, of_all, of_edge, flap_stays):
+    """Depths beside a board, 1 in front of a wall at distance 3, in the first of five views or in all of them."""
     monkeypatch.setattr(stereo_frames, "beside_edges", lambda shape, regions: np.full(shape, of_edge))
     cameras = [look_at((x, -3.0, 0.0), (0.0, 0.0, 0.0), size=(40, 30)) for x in (-0.8, -0.4, 0.0, 0.4, 0.8)]
     maps, frames = [], []
@@ -381,11 +380,11 @@ def test_depths_of_edges_that_others_see_through_are_not_fused(monkeypatch, conf
     frame = MergedFrames(frames, [VIEW] * 5, 5.0)[0]
     assert at_flap.sum() > 50
     assert (np.abs(frame.depth[at_flap] / maps[0].depth[at_flap] - 1) < 0.01).mean() == flap_stays
-    if flap_stays:  # what no plane has beside an edge is doubtful
+    if flap_stays:  # depths beside an edge without a plane are doubtful
         assert np.allclose(frame.confidence[at_flap], stereo_frames.DOUBTFUL_WEIGHT if of_edge else 1)
 
 
-def test_frames_are_rendered_for_all_views_together(found):
+def test_frames_are_read_in_one_pass(found):
     class Rendered(list):
         def __getitem__(self, index):
             raise AssertionError("frames that are not kept are rendered again whenever one is asked for")
@@ -393,16 +392,16 @@ def test_frames_are_rendered_for_all_views_together(found):
     assert MergedFrames(Rendered(rendered(0.01)), [VIEW], 5.0).flat == 0
 
 
-def test_rendered_depths_that_are_as_good_count_as_much(found):
+def test_rendered_depths_as_accurate_as_stereo_have_full_weight(found):
     assert MergedFrames(rendered(1e-5), [VIEW], 5.0).weight == 1
 
 
-def test_depths_beyond_the_limit_are_left_to_the_rendering(found):
+def test_stereo_depths_beyond_the_limit_are_not_used(found):
     merged = MergedFrames(rendered(0.01), [VIEW], 2.5)
     assert np.allclose(merged[0].depth, 3.03)
 
 
-def test_what_primitives_let_through_is_no_surface(found):
+def test_stereo_depths_in_background_are_not_used(found):
     (frame,) = rendered(0.01)
     frame.background[:, :5] = True
     merged = MergedFrames([frame], [VIEW], 5.0)[0]
@@ -413,7 +412,7 @@ def test_what_primitives_let_through_is_no_surface(found):
     )
 
 
-def test_depths_of_little_confidence_count_a_tenth_though_views_confirm_them(found):
+def test_confirmed_depths_of_low_confidence_count_as_doubtful(found):
     stereo_frames.depth_maps()[0].confidence[2:, :10] = 0.6
     frame = MergedFrames(rendered(0.01), [VIEW], 5.0)[0]
     assert np.allclose(frame.confidence[2:, :10], stereo_frames.DOUBTFUL_WEIGHT) and (frame.depth[2:, :20] == 3).all()
@@ -421,14 +420,14 @@ def test_depths_of_little_confidence_count_a_tenth_though_views_confirm_them(fou
 
 
 def sheet(low, high, y: float) -> Mesh:
-    """Two triangles across the view, between these x and z."""
+    """Two triangles at this y, between these x and z."""
     (x0, z0), (x1, z1) = low, high
     corners = np.array([[x0, y, z0], [x1, y, z0], [x1, y, z1], [x0, y, z1]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def merged_of(views: int, monkeypatch) -> MergedFrames:
-    """Views that see depth 3, so y = 0, in the picture's left half, where x < 0."""
+    """Views with depth 3 (y = 0) in the left half of the image, where x < 0."""
     maps = views * stereo_frames.depth_maps()[:1]
     monkeypatch.setattr(stereo_frames, "depth_maps", lambda *_, **__: maps)
     return MergedFrames(views * rendered(0.0), views * [VIEW], 5.0)
@@ -444,11 +443,11 @@ def test_small_pieces_stay_where_views_support_them(found, monkeypatch):
     kept, left_out = merged.supported(merge_parts([true, floating, large]), 0.1, 0.1)
     assert np.array_equal(kept.vertices, np.concatenate([true.vertices, large.vertices]))
     assert left_out == pytest.approx(0.04 / (0.08 + 1.7 * 1.1))
-    # What is smaller than can be told from noise goes.
+    # Pieces smaller than the noise are removed.
     assert len(merged.supported(merge_parts([true, large]), 0.1, 0.3)[0].faces) == 2
 
 
-def test_surface_beyond_the_reach_of_what_two_views_support_is_left_out(found, monkeypatch):
+def test_surface_without_support_of_two_views_is_removed(found, monkeypatch):
     x, z = np.meshgrid(np.linspace(-0.5, 0.5, 101), [-0.1, 0.1])
     corners = np.stack([x.ravel(), np.zeros(202), z.ravel()], 1)
     first = np.arange(100)
@@ -470,7 +469,7 @@ def test_a_closed_surface_stays_closed(found, monkeypatch):
     assert np.array_equal(kept.faces, closed.faces) and left_out == pytest.approx(0, abs=1e-12)
 
 
-def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypatch):
+def test_a_view_supports_a_point_only_by_fused_depths(found, monkeypatch):
     on_plane = np.full((30, 40), 3.0, np.float32)
     take_region_planes(monkeypatch, on_plane)
     point = np.array([[-0.4, 0.0, -0.2]])
@@ -481,7 +480,7 @@ def test_a_view_supports_a_point_once_and_only_by_what_is_fused(found, monkeypat
     assert MergedFrames([frame], [VIEW], 5.0).supporting(point) == [0]
 
 
-def test_doubtful_depths_support_only_where_they_are_asked_for(found):
+def test_doubtful_depths_support_only_on_request(found):
     merged = MergedFrames(rendered(0.0), [VIEW], 5.0)
     # Row 1 of the picture, 30 pixels a unit of depth: z = 13.5 / 30 * 3.
     doubtful, unknown = [-0.4, 0.0, 1.35], [-0.4, 0.0, 1.45]
@@ -489,7 +488,7 @@ def test_doubtful_depths_support_only_where_they_are_asked_for(found):
     assert merged.supporting(np.array([doubtful, unknown]), doubtful=True).tolist() == [1, 0]
 
 
-def test_a_surface_covers_the_pixels_whose_rays_hit_it(found):
+def test_covered_is_the_share_of_pixels_whose_rays_hit_the_surface(found):
     (frame,) = rendered(0.0)
     frame.depth[:, 36:] = 0
     merged = MergedFrames([frame], [VIEW], 5.0)

@@ -1,4 +1,4 @@
-"""Whether the surface of stereo is taken: by how much of it shows, and by whether photographs agree there."""
+"""Choice between the surfaces with and without stereo, by covered pixels and agreement of photographs."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from linprim_geo.surface.normals import vertex_normals
 
 @pytest.fixture(scope="module")
 def many_views(tmp_path_factory):
-    """A run of one octahedron whose views are so near to each other that stereo finds pairs."""
+    """A run of one octahedron with enough close views for stereo."""
     return octahedron_run(tmp_path_factory.mktemp("many"), views=60, size=40)
 
 
-# A surface of few faces: what is tested is whether stereo is taken, which is known before it is made.
+# Few faces: tests look at the choice, which is made before the final surface.
 COARSE = ExtractOptions(level=0.5, voxel_size=0.1)
 
 
@@ -60,7 +60,7 @@ def stereo_once(many_views, kept_maps, monkeypatch):
         (0.5, (), True),
     ],
 )
-def test_photographs_that_agree_clearly_less_often_speak_against_a_surface_in_few_pixels(
+def test_photographs_decide_about_a_surface_that_covers_few_pixels(
     many_views, stereo_once, monkeypatch, covered, shares, taken
 ):
     told = iter(shares)
@@ -77,7 +77,7 @@ def test_photographs_that_agree_clearly_less_often_speak_against_a_surface_in_fe
     "shares, asked, taken",
     [((0.95,), False, False), ((0.94, 0.95), True, True), ((0.94, 0.94), True, False)],
 )
-def test_an_object_with_masks_has_stereo_where_photographs_agree_more_often_with_it(
+def test_objects_with_masks_use_stereo_if_photographs_agree_more_often(
     many_views, stereo_once, monkeypatch, shares, asked, taken
 ):
     told = iter(shares)
@@ -90,7 +90,7 @@ def test_an_object_with_masks_has_stereo_where_photographs_agree_more_often_with
     assert not asked or (stats["stereo"]["taken"] is taken and stats["stereo"]["agreeing_without"] == 0.94)
 
 
-def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, stereo_once, monkeypatch):
+def test_stereo_on_fuses_stereo_and_predicts_errors_by_depths(many_views, stereo_once, monkeypatch):
     monkeypatch.setattr(postprocess, "predicted_error", lambda *_: pytest.fail("depths predict it"))
     stats = extract_mesh(many_views, options=replace(COARSE, stereo="on"), quiet=True)
     assert 0 <= stats["stereo"]["confirmed"] <= 1 and 0 < stats["stereo"]["rendered_weight"] <= 1
@@ -101,7 +101,7 @@ def test_a_surface_takes_stereo_into_account_where_it_is_asked_to(many_views, st
         extract_mesh(many_views, options=ExtractOptions(stereo="on"), blocks=2, quiet=True)
 
 
-def test_small_holes_are_closed_after_stereo_unless_edges_are_counted(many_views, stereo_once, monkeypatch):
+def test_small_holes_are_closed_after_stereo_unless_close_holes_is_given(many_views, stereo_once, monkeypatch):
     whole = MergedFrames.supported
 
     def pierced(frames, mesh, *rules):
@@ -118,7 +118,7 @@ def test_small_holes_are_closed_after_stereo_unless_edges_are_counted(many_views
     assert closing["boundary_edges"] == leaving["boundary_edges"] - 3 and closing["faces"] == leaving["faces"] + 1
 
 
-def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, stereo_once, monkeypatch):
+def test_the_rendered_surface_is_kept_if_stereo_supports_nothing(many_views, stereo_once, monkeypatch):
     nothing = Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
     monkeypatch.setattr(Scene, "has_alpha", False)
     monkeypatch.setattr(method_tsdf, "LEAST_CONFIRMED", 0.0)
@@ -129,7 +129,7 @@ def test_where_nothing_is_supported_the_rendered_surface_stays(many_views, stere
         extract_mesh(many_views, options=replace(COARSE, stereo="on"), quiet=True)
 
 
-def test_photographs_agree_within_reach_of_the_true_surface_alone(tiny_scene):
+def test_photographs_agree_more_often_on_the_true_surface(tiny_scene):
     views = load_scene(tiny_scene).train
     true = load_mesh(tiny_scene / "reference.ply")
     gains = np.ones(len(views))

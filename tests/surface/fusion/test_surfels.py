@@ -1,4 +1,4 @@
-"""The plane of each pixel of a depth map, against the formulas pixel by pixel and against a plane."""
+"""Planes of the pixels of a depth map, compared with the formulas per pixel and with an exact plane."""
 
 from __future__ import annotations
 
@@ -67,14 +67,14 @@ def some_frame(width: int, height: int, seed: int) -> DepthFrame:
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 9), (12, 1), (23, 17)])
 @pytest.mark.parametrize("seed", range(3))
-def test_every_pixel_by_the_formulas(width, height, seed):
+def test_surfels_agree_with_the_formulas_per_pixel(width, height, seed):
     frame = some_frame(width, height, seed)
     table = surfels(frame, VOXEL, TRUNCATION, ORIGIN).reshape(height, width, 8)
     expected = np.array([[row_of(frame, y, x) for x in range(width)] for y in range(height)])
     np.testing.assert_allclose(table, expected, rtol=2e-6, atol=2e-6)
 
 
-def test_a_plane_has_its_distance_at_every_pixel():
+def test_surfels_of_a_plane_give_its_exact_distance():
     view = camera(30, 20)
     normal, distance = np.array([0.3, -0.4, 1.0]), 2.5  # in the camera's space
     depth = distance / (view.ray_grid() @ normal)
@@ -86,7 +86,7 @@ def test_a_plane_has_its_distance_at_every_pixel():
     assert np.abs(found - exact).max() < 1e-5 * np.abs(exact).max()
 
 
-def test_what_is_not_said_of_a_frame_is_nothing():
+def test_defaults_of_frames_equal_explicit_values():
     frame = some_frame(23, 17, 0)
     plain = surfels(DepthFrame(frame.camera, frame.depth), VOXEL, TRUNCATION, ORIGIN)
     nothing = np.zeros(frame.depth.shape, bool)
@@ -97,7 +97,7 @@ def test_what_is_not_said_of_a_frame_is_nothing():
     assert (unsure[:, [4, 7]] == 0).all() and np.array_equal(unsure[:, :4], plain[:, :4])
 
 
-def test_the_same_bits_for_any_number_of_threads():
+def test_results_do_not_depend_on_threads():
     frame, before = some_frame(211, 97, 1), ops.threads()
     try:
         found = []

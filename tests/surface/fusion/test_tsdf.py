@@ -1,4 +1,4 @@
-"""Fusing depth maps and what cameras see, against surfaces whose depth is known in closed form."""
+"""Fusion of depth maps and visibility, compared with surfaces of known depth."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def around(count, radius=3.0, **options) -> list[Camera]:
 
 
 def sphere_depth(camera: Camera, radius=1.0, center=(0.0, 0.0, 0.0)) -> np.ndarray:
-    """Nearest root of |c + d r - m| = radius along the rays with z = 1; 0 for a miss."""
+    """Depth of a sphere by the nearer root of |c + d r - m| = radius, with rays r of z = 1; 0 for a miss."""
     rays = camera.world_rays()
     start = camera.center - np.asarray(center)
     a = (rays**2).sum(-1)
@@ -84,7 +84,7 @@ def radial_error(mesh: Mesh) -> np.ndarray:
 # --- accuracy --------------------------------------------------------------------------------------------
 
 
-def test_a_sphere_comes_out_round_and_closed(ball):
+def test_a_sphere_is_accurate_and_closed(ball):
     error = radial_error(ball) / 0.05
     # The chord between two voxels bends away from the sphere by h^2 / 8 = 0.006 voxel; pixels are 0.25 voxel.
     assert np.sqrt((error**2).mean()) < 0.02 and np.abs(error).max() < 0.1
@@ -100,8 +100,8 @@ def test_normals_point_outward(ball):
     assert along.min() > 0.9 and along.mean() > 0.995
 
 
-def test_a_slanted_plane_is_exact_whatever_the_pixels():
-    # 1/z is linear over a plane, so pixels five voxels wide and 75 degrees of slant cost nothing.
+def test_a_slanted_plane_is_exact_with_large_pixels():
+    # 1/z is linear over a plane, so pixels of five voxels and a slant of 75 degrees cause no error.
     normal = np.array([np.cos(np.radians(15)), 0.0, -np.sin(np.radians(15))])
     camera = Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
     depth = (normal @ [0, 0, 3.0]) / (camera.ray_grid() @ normal)
@@ -113,7 +113,7 @@ def test_a_slanted_plane_is_exact_whatever_the_pixels():
     assert (mesh.normals @ normal > 0.99).mean() > 0.99  # towards the camera
 
 
-def test_edges_and_faces_of_a_box():
+def test_a_box_is_accurate_and_closed():
     mesh = fuse_tsdf(box_frames(around(40)), voxel_size=0.04)
     stats = topology(mesh)
     assert stats["watertight"] and stats["genus"] == 0
@@ -125,7 +125,7 @@ def test_edges_and_faces_of_a_box():
     assert stats["volume"] == pytest.approx(8 * half.prod(), rel=0.01)
 
 
-def test_a_sheet_thinner_than_two_voxels_keeps_both_sides_where_they_are():
+def test_both_sides_of_a_thin_sheet_are_accurate():
     mesh = fuse_tsdf(box_frames(around(40), half=(0.8, 0.6, 0.03)), voxel_size=0.04)
     flat = np.abs(mesh.vertices[:, :2]).max(1) < 0.5
     height = mesh.vertices[flat, 2]
@@ -133,7 +133,7 @@ def test_a_sheet_thinner_than_two_voxels_keeps_both_sides_where_they_are():
     assert topology(mesh)["watertight"]
 
 
-def test_far_from_the_origin_the_surface_is_the_same(ball):
+def test_accuracy_does_not_depend_on_the_distance_from_the_origin(ball):
     offset = np.array([4e5, -2e5, 1e5])
     moved = []
     for frame in sphere_frames(around(24)):
@@ -141,7 +141,7 @@ def test_far_from_the_origin_the_surface_is_the_same(ball):
         pose[:3, 3] -= pose[:3, :3] @ offset
         moved.append(replace(frame, camera=replace(frame.camera, world_to_camera=pose)))
     far = fuse_tsdf(moved, voxel_size=0.05)
-    # The grid's phase differs by the rounding of the offset, so vertices are compared by what they lie on.
+    # Rounding of the offset shifts the grid, so distances to the surface are compared, not vertices.
     error = np.linalg.norm(far.vertices - offset, axis=1) - 1.0
     assert np.sqrt((error**2).mean()) < 1.2 * np.sqrt((radial_error(ball) ** 2).mean())
 
@@ -150,7 +150,7 @@ def test_far_from_the_origin_the_surface_is_the_same(ball):
 
 
 def with_phantom(frames, value) -> list[DepthFrame]:
-    """A patch in the corner of the first image, beside the sphere, claims a surface."""
+    """Add a patch of wrong depths in a corner of the first image, beside the sphere."""
     depth = frames[0].depth.copy()
     depth[8:24, 8:24] = value
     background = frames[0].background & (depth == 0)
@@ -161,20 +161,20 @@ def pieces(mesh: Mesh) -> int:
     return face_components(mesh)[0]
 
 
-def test_background_carves_what_one_view_imagines():
+def test_background_removes_a_surface_of_one_view():
     frames = with_phantom(sphere_frames(around(10)), 3.0)
     mesh = fuse_tsdf(frames, voxel_size=0.05, min_component=0)
     np.testing.assert_array_equal(mesh.vertices, fuse_tsdf(frames, voxel_size=0.05).vertices)
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
 
 
-def test_unknown_pixels_carve_nothing():
+def test_unknown_pixels_remove_no_surface():
     frames = [replace(f, background=None) for f in with_phantom(sphere_frames(around(10)), 3.0)]
     assert pieces(fuse_tsdf(frames, voxel_size=0.05, min_component=0)) > 1
     assert pieces(fuse_tsdf(frames, voxel_size=0.05, min_component=0.5)) == 1
 
 
-def test_depth_far_behind_carves_too():
+def test_depths_far_behind_remove_a_surface_of_one_view():
     # Instead of background there is a wall (a large sphere seen from inside) behind everything.
     frames = []
     for frame in with_phantom(sphere_frames(around(10)), 3.0):
@@ -187,7 +187,7 @@ def test_depth_far_behind_carves_too():
     assert pieces(mesh) == 1 and np.abs(radial_error(mesh)).max() < 0.25 * 0.05
 
 
-def test_clamped_depths_clear_the_space_before_them_and_nothing_else(ball):
+def test_clamped_depths_only_mark_free_space(ball):
     frames = with_phantom(sphere_frames(around(10)), 3.0)
     clear = [replace(f, depth=np.where(f.background, 4.5, f.depth), clamped=f.background) for f in frames]
     mesh = fuse_tsdf(clear, voxel_size=0.05, min_component=0)
@@ -199,13 +199,13 @@ def test_clamped_depths_clear_the_space_before_them_and_nothing_else(ball):
         == fuse.auto_voxel_size(frames)
         < fuse.auto_voxel_size([replace(f, clamped=None) for f in clear])
     )
-    # Cameras whose every depth is clamped before the sphere do not contradict those that see it.
+    # Cameras with all depths clamped in front of the sphere do not contradict those that see it.
     views, everywhere = sphere_frames(around(24)), np.ones((SIZE, SIZE), bool)
     before = [replace(f, depth=np.ones((SIZE, SIZE)), clamped=everywhere, background=None) for f in views]
     np.testing.assert_array_equal(fuse_tsdf([*views, *before], voxel_size=0.05).vertices, ball.vertices)
 
 
-def test_invalid_depths_of_every_kind_are_no_surface(ball):
+def test_invalid_depths_are_ignored(ball):
     frames = sphere_frames(around(24))
     for k, value in enumerate((0.0, -1.0, np.nan, np.inf, -np.inf)):
         frames[k] = replace(frames[k], depth=np.where(frames[k].background, value, frames[k].depth))
@@ -214,7 +214,7 @@ def test_invalid_depths_of_every_kind_are_no_surface(ball):
     np.testing.assert_array_equal(mesh.faces, ball.faces)
 
 
-def test_pixels_without_confidence_do_not_count():
+def test_pixels_of_zero_confidence_are_ignored():
     frames = with_phantom(sphere_frames(around(10)), 3.0)
     confidence = np.ones((SIZE, SIZE))
     confidence[:32, :32] = 0.0
@@ -224,7 +224,7 @@ def test_pixels_without_confidence_do_not_count():
 
 
 def test_occluded_votes_close_tunnels():
-    # In one view a few pixels look right through the ball: free space inside that no other view can deny.
+    # A few pixels of one view have depths behind the ball, which makes free space inside of it.
     frames = sphere_frames(around(24))
     depth = frames[0].depth.copy()
     depth[SIZE // 2 - 4 : SIZE // 2 + 4, SIZE // 2 - 4 : SIZE // 2 + 4] = 3.0
@@ -241,7 +241,7 @@ def test_occluded_votes_close_tunnels():
 
 
 def votes_in_float64(table, rules, position, pixel, inverse):
-    """(value * weight, weight, free) of one surfel per voxel, written from the rules alone."""
+    """(value * weight, weight, free) of one surfel per voxel, by the rules in float64."""
     near, far_front, behind, behind_weight, grazed, grazed_reach, grazed_weight, occluded = rules
     rows = table[pixel].astype(np.float64)
     value = rows[:, 3] - (rows[:, :3] * position).sum(1)
@@ -260,7 +260,7 @@ def votes_in_float64(table, rules, position, pixel, inverse):
 
 
 @pytest.mark.parametrize("occluded", [0.0, 0.02])
-def test_votes_are_those_of_the_rules(occluded):
+def test_votes_agree_with_float64(occluded):
     rng, camera = np.random.default_rng(3), Camera(40, 30, 51.37, 46.71, 19.31, 15.83, np.eye(4))
     table = rng.normal(size=(camera.width * camera.height, 8)).astype(np.float32)
     table[:, 3] += table[:, 2] * 2  # planes near the blocks
@@ -292,7 +292,7 @@ def test_votes_are_those_of_the_rules(occluded):
 
 
 @pytest.mark.parametrize("voxel", [0.01, 10.0])
-def test_blocks_that_a_camera_may_show_are_in_view_whatever_the_unit(voxel):
+def test_in_view_contains_all_visible_blocks_at_any_scale(voxel):
     camera = Camera(40, 30, 50.0, 50.0, 20.0, 15.0, np.eye(4))
     blocks = np.stack([axis.ravel() for axis in np.meshgrid(*[np.arange(-8, 8)] * 3)], axis=1)
     levels = np.zeros(len(blocks), np.int64)
@@ -308,7 +308,7 @@ def test_blocks_that_a_camera_may_show_are_in_view_whatever_the_unit(voxel):
 # --- contract --------------------------------------------------------------------------------------------
 
 
-def test_the_same_bytes_at_any_number_of_threads():
+def test_results_do_not_depend_on_threads():
     frames, meshes = sphere_frames(around(8)), []
     for count in (1, 2, 3):
         ops.set_threads(count)
@@ -320,7 +320,7 @@ def test_the_same_bytes_at_any_number_of_threads():
         assert getattr(one, name).tobytes() == getattr(again, name).tobytes()
 
 
-def test_a_size_that_does_not_fit_is_refused_with_one_that_does():
+def test_too_small_voxels_are_refused_with_a_size_that_fits():
     frames = sphere_frames(around(6))
     with pytest.raises(LinprimError, match="a voxel size of (.*) fits") as caught:
         fuse_tsdf(frames, voxel_size=0.01, memory_limit=60 * 2**20)
@@ -331,7 +331,7 @@ def test_a_size_that_does_not_fit_is_refused_with_one_that_does():
     assert "MiB of 60 MiB" in lines[0]
 
 
-def test_what_cannot_be_fused_is_one_sentence():
+def test_invalid_input_is_refused():
     frames = sphere_frames(around(3))
     empty = [replace(f, depth=np.zeros_like(f.depth)) for f in frames]
     for wrong, message in (
@@ -349,12 +349,12 @@ def test_what_cannot_be_fused_is_one_sentence():
             wrong()
 
 
-def test_an_iterator_is_refused_because_it_ends():
+def test_an_iterator_is_refused():
     with pytest.raises(TypeError, match="only once"):
         fuse_tsdf(iter(sphere_frames(around(3))), voxel_size=0.1)
 
 
-def test_a_surface_that_every_other_view_denies_is_no_surface():
+def test_a_surface_contradicted_by_all_other_views_is_removed():
     frames = with_phantom(sphere_frames(around(24)), 3.0)
     blind = [replace(frames[0], depth=np.where(frames[0].depth == 3.0, 3.0, 0.0), background=None)]
     blind += [replace(f, depth=np.zeros_like(f.depth), background=np.ones_like(f.background)) for f in frames[1:]]
@@ -384,14 +384,14 @@ def paint(points: np.ndarray) -> np.ndarray:
     return np.clip(np.round(127.5 + 100 * np.sin(2 * points)), 0, 255).astype(np.uint8)
 
 
-def test_vertex_colours_are_those_of_the_photographs(ball):
+def test_vertex_colours_agree_with_photographs(ball):
     frames = sphere_frames(around(24))
     cameras = [frame.camera for frame in frames]
     pictures = []
     for frame in frames:
         points = frame.camera.world_rays() * frame.depth[..., None] + frame.camera.center
         pictures.append(np.where(frame.background[..., None], 0, paint(points)).astype(np.uint8))
-    # One photograph is spoiled: the median does not notice.
+    # The median is robust against one wrong photograph.
     pictures[5] = 255 - pictures[5]
     colors = visibility.color_vertices(ball, cameras, pictures)
     error = np.abs(colors.astype(int) - paint(ball.vertices))
@@ -401,7 +401,7 @@ def test_vertex_colours_are_those_of_the_photographs(ball):
     assert np.abs(again.astype(int) - colors).max() <= 1
 
 
-def test_unseen_vertices_take_the_colour_of_their_neighbours(ball):
+def test_unseen_vertices_take_colours_of_neighbours_or_grey(ball):
     camera = look_at([3, 0, 0])
     red = np.zeros((SIZE, SIZE, 3), dtype=np.uint8)
     red[..., 0] = 200
@@ -412,7 +412,7 @@ def test_unseen_vertices_take_the_colour_of_their_neighbours(ball):
         visibility.color_vertices(ball, [camera], [red[:64, :64]])
 
 
-def test_what_stands_in_front_does_not_colour_what_is_behind(ball):
+def test_occluders_do_not_colour_surfaces_behind_them(ball):
     both = Mesh(
         np.concatenate([ball.vertices, 0.5 * ball.vertices + [2.0, 0, 0]]),
         np.concatenate([ball.faces, ball.faces + len(ball.vertices)]),
@@ -430,7 +430,7 @@ def test_what_stands_in_front_does_not_colour_what_is_behind(ball):
         assert (colors[hidden] == [200, 0, 0]).all(1).mean() > 0.95
 
 
-def test_visible_faces_are_those_in_view_and_not_hidden(ball):
+def test_visible_faces_are_in_view_and_unoccluded(ball):
     camera = look_at([3, 0, 0])
     centers = ball.vertices[ball.faces].mean(1)
     height = centers[:, 0]  # the horizon of a sphere seen from distance 3 is at 1/3
@@ -445,7 +445,7 @@ def test_visible_faces_are_those_in_view_and_not_hidden(ball):
     assert not visibility.visible_faces(ball, [look_at([3, 0, 0], target=(6, 0, 0))]).any()
 
 
-def test_small_faces_between_pixels_are_seen(ball):
+def test_faces_smaller_than_pixels_are_visible(ball):
     coarse = around(12, size=8)
     assert visibility.visible_faces(ball, coarse).all()
 

@@ -1,4 +1,4 @@
-"""Voxels are small where a surface bends, large where it is flat, and no smaller than pixels and noise allow."""
+"""Voxel sizes: small on curved surfaces, large on flat ones, limited by pixels and noise."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def around(count=16, height=1.6) -> list[Camera]:
 
 
 def ball_on_floor(cameras, noise=0.0, rod=0.0) -> list[DepthFrame]:
-    """Depths of the floor z = 0, a ball on it, and a `rod` of that radius above it along y, with noise."""
+    """Depths of the floor z = 0, a ball on it, and a rod of radius `rod` along y above it, with noise."""
     rng, frames = np.random.default_rng(0), []
     for each in cameras:
         rays, eye = each.world_rays(), each.center
@@ -79,7 +79,7 @@ def fused(frames, **options) -> Mesh:
 
 
 def edges_near(mesh: Mesh, near) -> float:
-    """Median length of the edges of faces whose middle is `near`."""
+    """Median edge length of faces whose centres satisfy `near`."""
     corners = mesh.vertices[mesh.faces]
     corners = corners[near(corners.mean(1))]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)))
@@ -104,7 +104,7 @@ def mesh(frames):
     return fused(frames)
 
 
-def test_a_ball_on_a_floor_has_small_voxels_and_the_floor_large_ones(frames, mesh):
+def test_voxels_are_small_on_a_ball_and_large_on_the_floor(frames, mesh):
     uniform = fuse_tsdf(frames, voxel_size=USUAL)
     floor = lambda points: (np.linalg.norm(points[:, :2], axis=1) > 0.6) & (np.abs(points).max(1) < 0.9)  # noqa: E731
     assert edges_near(mesh, floor) == pytest.approx(COARSE_RATIO * edges_near(uniform, floor), rel=0.1)
@@ -114,16 +114,16 @@ def test_a_ball_on_a_floor_has_small_voxels_and_the_floor_large_ones(frames, mes
     assert np.abs(flat[:, 2]).max() < 0.0061 * COARSE_RATIO * USUAL  # see tsdf_field.ZERO_GAP
 
 
-def test_it_has_no_cracks_where_sizes_change(mesh):
+def test_no_cracks_where_voxel_sizes_change(mesh):
     assert topology(mesh)["non_manifold_edges"] == 0
     edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
     edges, count = np.unique(edges, axis=0, return_counts=True)
     ends = mesh.vertices[edges[count == 1]].mean(1)[:, :2]
-    # There is an end where the floor ends, and one below the ball, which no camera sees.
+    # Borders are at the end of the floor and below the ball, which no camera sees.
     assert ((np.linalg.norm(ends, axis=1) > 0.8) | (np.linalg.norm(ends, axis=1) < 1.2 * RADIUS)).all() and len(ends)
 
 
-def test_blocks_fill_space_once_and_their_levels_differ_by_one_at_most(frames):
+def test_blocks_do_not_overlap_and_adjacent_levels_differ_by_one(frames):
     lattice = split(frames)
     assert len(np.unique(lattice.levels)) >= 3
     parents = [np.unique(block_keys(lattice.blocks[lattice.levels == level])) for level in range(5)]
@@ -136,19 +136,19 @@ def test_blocks_fill_space_once_and_their_levels_differ_by_one_at_most(frames):
             assert not np.isin(block_keys(around >> (larger - level)), parents[larger]).any()
 
 
-def test_fewer_faces_are_larger_ones(frames):
+def test_the_number_of_faces_is_limited(frames):
     counts = [len(fuse_lattice(split(frames, most), frames).faces) for most in (1e6, 20_000, 100)]
     assert counts[0] > 30_000 and 15_000 < counts[1] < 20_000 and counts[1] >= counts[2]
 
 
-def test_voxels_are_no_smaller_than_noise_allows(frames):
-    """Noise of 0.5 % in depths of 2, seen at 45 degrees: 2.7 times what that is off the floor is the usual voxel."""
+def test_noise_limits_the_smallest_voxels(frames):
+    """Noise of 0.5 % of depths of 2 at 45 degrees. Times NOISE_VOXELS, it is about as large as the usual voxel."""
     small = lambda lattice: (lattice.voxel_sizes() < 0.9 * USUAL).sum()  # noqa: E731
     assert NOISE_VOXELS * 0.005 * 2 * np.sqrt(0.5) > 0.9 * USUAL
     assert small(split(ball_on_floor(around(), noise=0.005))) < small(split(frames)) / 10
 
 
-def test_what_coarse_voxels_lose_has_the_usual_ones():
+def test_surfaces_missing_in_coarse_voxels_get_usual_voxels():
     """A rod much thinner than a coarse voxel."""
     rod = ball_on_floor(around(24), rod=0.45 * USUAL)
     on_rod = lambda points: (points[:, 2] > 0.25).sum()  # noqa: E731
@@ -159,8 +159,8 @@ def test_what_coarse_voxels_lose_has_the_usual_ones():
     assert on_rod(found.vertices) > 0.8 * on_rod(usual.vertices)
 
 
-def test_where_the_usual_ones_are_too_many_faces_what_bends_is_divided_all_the_same(frames):
-    """Depths of the floor that its coarse surface does not explain ask for more faces than there may be."""
+def test_curved_parts_are_refined_although_usual_voxels_exceed_the_faces(frames):
+    """Outliers in depths of the floor would take more faces than are allowed."""
     rng, off = np.random.default_rng(0), []
     for frame in frames:
         floor = np.abs(frame.depth * frame.camera.world_rays()[..., 2] + frame.camera.center[2]) < 1e-3
@@ -181,23 +181,23 @@ def test_a_plane_alone_stays_coarse():
     assert VoxelLevels(lattice, fuse_lattice(lattice, plane), plane, 1e6).lattice is lattice
 
 
-def test_what_does_not_count_is_not_divided(frames):
+def test_depths_without_surface_get_usual_voxels_only(frames):
     lattice = coarse_lattice(frames)
     surface = fuse_lattice(lattice, frames)
     floor = np.linalg.norm(surface.vertices[:, :2], axis=1) > 0.4
     inner = np.abs(surface.vertices).max(1) < 0.7
     floor = Mesh(surface.vertices[floor & inner], np.zeros((0, 3), np.int64))
-    # What has depths and no surface gets the usual voxels.
+    # Blocks with depths but without surface get the usual voxels.
     assert VoxelLevels(lattice, floor, frames, 1e6).lattice.voxel == pytest.approx(USUAL)
 
 
-def test_where_small_voxels_tear_the_surface_the_usual_ones_mend_it(frames):
-    """As if depths of views agreed on the top of the ball within large voxels alone."""
+def test_torn_blocks_are_coarsened(frames):
+    """The fine surface has a hole at the top of the ball, which the coarse one has not."""
     lattice = coarse_lattice(frames)
     coarse = fuse_lattice(lattice, frames)
     levels = VoxelLevels(lattice, coarse, frames, 1e6)
     fine = fuse_lattice(levels.lattice, frames)
-    assert not levels.coarsen_torn_blocks(coarse, fine)  # what both end at is no tear
+    assert not levels.coarsen_torn_blocks(coarse, fine)  # borders of both surfaces are no tears
     hole = np.linalg.norm(fine.vertices[fine.faces].mean(1) - [0, 0, 2 * RADIUS], axis=1) > 0.04
     at_top = lambda points: np.linalg.norm(points - [0, 0, 2 * RADIUS], axis=1) < 0.03  # noqa: E731
     assert edges_near(fine, at_top) < 0.6 * USUAL
@@ -207,7 +207,7 @@ def test_where_small_voxels_tear_the_surface_the_usual_ones_mend_it(frames):
     assert mended.vertices[:, 2].max() > 1.9 * RADIUS and topology(mended)["non_manifold_edges"] == 0
 
 
-def test_blocks_are_divided_as_far_as_memory_goes(frames):
+def test_memory_limits_the_refinement(frames):
     whole, coarse = split(frames), coarse_lattice(frames)
     need = [estimate_memory(len(each.blocks), 4, SIZE**2) for each in (coarse, whole)]
     limit = (need[0] + need[1]) // 2
@@ -216,7 +216,7 @@ def test_blocks_are_divided_as_far_as_memory_goes(frames):
     assert len(split(frames, limit=need[0]).blocks) == len(coarse.blocks)
 
 
-def test_a_coarse_field_that_does_not_fit_is_refused_with_a_size_that_does(frames):
+def test_a_coarse_field_that_exceeds_memory_is_refused_with_a_size_that_fits(frames):
     with pytest.raises(TooFine) as caught:
         fused(frames, memory_limit=9_000_000)
     found = fuse_tsdf(
@@ -227,7 +227,7 @@ def test_a_coarse_field_that_does_not_fit_is_refused_with_a_size_that_does(frame
     assert re.fullmatch(sizes, str(caught.value))
 
 
-def test_points_far_from_each_other_are_in_blocks_of_their_own():
+def test_distant_points_are_in_separate_blocks():
     """Keys of pairs of voxels hold two million voxels on either side."""
     place = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, 1.0], [0.25, 0.5, -1.0]]) * 2_000_000
     near = NearBlocks(1.0, 3.0, 4)

@@ -1,5 +1,4 @@
-"""Surfaces as levels of the opacity field: the field itself, marching tetrahedra, and meshes of runs whose surface is
-known."""
+"""Surfaces as levels of the opacity field: the field, marching tetrahedra, and meshes of runs with known surface."""
 
 from __future__ import annotations
 
@@ -57,26 +56,26 @@ def one_octahedron(density=2.0) -> Primitives:
 # --- the field -------------------------------------------------------------------------------------------
 
 
-def test_the_largest_transmittance_of_the_rank_wanted():
+def test_robust_largest_takes_the_given_rank():
     light = np.array([[0.1, 0.2], [0.9, 0.2], [0.5, 0.8], [0.0, 0.0]], dtype=np.float32)
     ones = np.ones_like(light)
     assert opacity.robust_largest(light, ones, 0.0) == pytest.approx([0.9, 0.8])
     assert opacity.robust_largest(light, ones, 1 / 3) == pytest.approx([0.5, 0.2])
     assert opacity.robust_largest(light, ones, 0.5 / 3) == pytest.approx([0.7, 0.5])
-    # A camera that does not have the point in view counts as little as one that is not there.
+    # A camera without the point in view counts as a missing one.
     assert opacity.robust_largest(light[[0, 2]], ones[:2], 0.0) == pytest.approx(
         opacity.robust_largest(light, np.array([[1, 1], [0, 0], [1, 1], [0, 0]], np.float32), 0.0)
     )
 
 
-def test_free_space_has_the_weight_that_the_views_leave():
+def test_missing_weight_counts_as_free_space():
     light = np.array([[0.25]], dtype=np.float32)
     for weight in (0.0, 0.25, 0.5, 1.0):
         found = opacity.robust_largest(light, np.array([[weight]], dtype=np.float32))
         assert found == pytest.approx([1 - weight + weight * 0.25])
 
 
-def test_a_fading_camera_changes_the_field_without_a_jump():
+def test_the_field_is_continuous_in_camera_weights():
     rng = np.random.default_rng(0)
     light = rng.random((9, 1)).astype(np.float32)
     weight = np.ones((9, 1), dtype=np.float32)
@@ -87,7 +86,7 @@ def test_a_fading_camera_changes_the_field_without_a_jump():
     assert np.abs(np.diff(values)).max() < 0.03 and np.ptp(values) > 0.01
 
 
-def test_light_from_one_camera():
+def test_transmittance_of_one_camera_agrees_with_the_closed_form():
     (camera,) = looking_at_origin((0, 0, -3))
     field = opacity.OpacityField(one_octahedron(), [camera])
     points = np.array(
@@ -102,7 +101,7 @@ def test_light_from_one_camera():
     assert field.transmittance(points)[6:] == pytest.approx([1, 1])
 
 
-def test_the_border_of_the_image_fades():
+def test_weights_fall_linearly_to_the_image_border():
     (camera,) = looking_at_origin((0, 0, -3))
     field = opacity.OpacityField(one_octahedron(), [camera])
     offsets = (49.5, 48.5, 47.5, 46.0, 50.5)
@@ -110,7 +109,7 @@ def test_the_border_of_the_image_fades():
     assert field.per_camera(across)[1][0] == pytest.approx([0.5 / 3, 1.5 / 3, 2.5 / 3, 1, 0], abs=1e-6)
 
 
-def test_nothing_before_the_near_plane_absorbs():
+def test_primitives_before_the_near_plane_do_not_absorb():
     (camera,) = looking_at_origin((0, 0, -3))
     near = Primitives([[0, 0, -3]], [[1, 0, 0, 0]], [[0.009] * 3], [1e6], np.zeros((1, 1, 3)))
     assert opacity.OpacityField(near, [camera]).transmittance(np.zeros((1, 3))) == pytest.approx([1])
@@ -118,7 +117,7 @@ def test_nothing_before_the_near_plane_absorbs():
     assert opacity.OpacityField(beyond, [camera]).transmittance(np.zeros((1, 3))) < 0.03
 
 
-def test_one_leak_among_many_cameras_carves_nothing():
+def test_one_leaking_camera_does_not_change_the_field():
     rng = np.random.default_rng(1)
     eyes = rng.normal(size=(60, 3))
     cameras = looking_at_origin(*(3 * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)))
@@ -155,7 +154,7 @@ def tetrahedra_of_a_ball(count=1500, seed=3):
     return points, Delaunay(points).simplices.astype(np.int64), Delaunay(points).convex_hull
 
 
-def test_marching_gives_a_closed_ball_that_is_outward():
+def test_marching_tetrahedra_give_a_closed_outward_ball():
     points, cells, _ = tetrahedra_of_a_ball()
     radius = np.linalg.norm(points, axis=1)
     edges, faces = march_tetrahedra(points, cells, radius < 1.2)
@@ -169,7 +168,7 @@ def test_marching_gives_a_closed_ball_that_is_outward():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_marching_is_a_manifold_for_any_labels(seed):
+def test_marching_tetrahedra_give_a_manifold_for_random_labels(seed):
     points, cells, hull = tetrahedra_of_a_ball(300, seed)
     inside = np.random.default_rng(seed).random(len(points)) < 0.4
     inside[np.unique(hull)] = False
@@ -181,7 +180,7 @@ def test_marching_is_a_manifold_for_any_labels(seed):
     assert manifold_status(mesh) == "NoError"
 
 
-def test_marching_without_a_surface():
+def test_marching_tetrahedra_without_a_surface_give_no_faces():
     points, cells, _ = tetrahedra_of_a_ball(20)
     for inside in (np.zeros(20, bool), np.ones(20, bool)):
         edges, faces = march_tetrahedra(points, cells, inside)
@@ -208,7 +207,7 @@ def test_components_that_no_camera_sees_are_dropped():
 # --- meshes of runs --------------------------------------------------------------------------------------
 
 
-def test_what_is_written(extracted):
+def test_output_files_and_stats(extracted):
     stats, folder = extracted
     assert sorted(path.name for path in folder.iterdir()) == [
         "mesh.ply",
@@ -224,7 +223,7 @@ def test_what_is_written(extracted):
     assert 0.97 * stats["faces"] <= stats["visible"]["faces"] <= stats["faces"]
 
 
-def test_the_mesh_is_the_surface(extracted, solid):
+def test_the_mesh_agrees_with_the_reference(extracted, solid):
     stats, folder = extracted
     mesh, reference = load_mesh(folder / "mesh.ply"), load_mesh(solid.parent / "scene" / "reference.ply")
     scores, truth = score_mesh(mesh, reference, samples=20_000), topology(reference)
@@ -241,13 +240,13 @@ def test_normals_colours_and_quality(extracted):
     mesh = load_mesh(extracted[1] / "mesh.ply")
     outward = mesh.vertices - np.array(CENTER)
     assert (np.einsum("vc,vc->v", mesh.normals, outward) > 0).mean() > 0.97
-    # Of slivers as thin as the file's digits not even the direction is left.
+    # Normals of the thinnest slivers are lost in the file's float32.
     assert np.quantile(np.abs(mesh.normals - vertex_normals(mesh)).max(1), 0.9) < 1e-3
     assert np.abs(np.median(mesh.colors.astype(float), 0) - 178).max() <= 2
     assert (mesh.quality >= 0).all()
 
 
-def test_uncertainty_is_larger_where_few_cameras_look():
+def test_spread_is_larger_where_few_cameras_look():
     eyes = np.random.default_rng(4).normal(size=(40, 3))
     eyes[:, 2] = -np.abs(eyes[:, 2]) - 0.5
     eyes[0] = 0.1, 0.2, 1.0
@@ -288,7 +287,7 @@ def test_a_wider_spacing_gives_fewer_triangles(solid, tmp_path):
     assert fine > 3 * coarse > 0
 
 
-def test_a_trained_part_is_closed_near_the_truth_and_the_same_again(tiny_run, tiny_scene, tmp_path):
+def test_a_trained_part_is_closed_accurate_and_reproducible(tiny_run, tiny_scene, tmp_path):
     before, files = ops.threads(), []
     for threads in (1, 2):
         ops.set_threads(threads)
@@ -318,7 +317,7 @@ def test_a_run_of_gaussians_is_refused(solid, tmp_path):
     assert not (tmp_path / "m.ply").exists()
 
 
-def test_tetrahedra_that_do_not_fit_are_refused(solid, tmp_path):
+def test_tetrahedra_that_exceed_memory_are_refused(solid, tmp_path):
     for limit, sentence in (
         (PROCESS_GIB + 1e-5, "GiB are allowed"),
         (1e-5, "--memory-limit is 1e-05 GiB, wanted more"),
@@ -327,7 +326,7 @@ def test_tetrahedra_that_do_not_fit_are_refused(solid, tmp_path):
             extract_mesh(solid, METHOD, tmp_path / "m.ply", ExtractOptions(memory_limit=limit), quiet=True)
 
 
-def test_the_command_line_knows_it(solid, tmp_path, capsys):
+def test_the_command_line_has_the_method(solid, tmp_path, capsys):
     output = tmp_path / "part.obj"
     command = ["extract-mesh", str(solid), "--method", METHOD, "--voxel-size", "0.3", "-o", str(output), "--json"]
     assert main(command) == 0

@@ -1,5 +1,4 @@
-"""The direct surface: unions of known volume, cuts at known planes, what is dropped, and what the order of the input
-may change."""
+"""Surfaces by unions of primitives: known volumes, cuts by known planes, removed parts, and reproducibility."""
 
 from __future__ import annotations
 
@@ -38,7 +37,7 @@ def box(low, high):
 
 
 def octahedra(count, seed=0, size=0.12):
-    """Octahedra of any direction that overlap, all over the unit cube."""
+    """Overlapping octahedra of random orientation in the unit cube."""
     random = np.random.default_rng(seed)
     return Primitives(
         random.random((count, 3)),
@@ -50,7 +49,7 @@ def octahedra(count, seed=0, size=0.12):
 
 
 def traced(run, level=0.75):
-    """The surface, the primitive of each face, and counts."""
+    """(surface, primitive of each face, statistics) of a run."""
     mesh, about = polyhedra_surface(
         Run.open(run), ExtractOptions(level=level), Stages(Progress("extract", 1, quiet=True))
     )
@@ -71,7 +70,7 @@ def is_closed(mesh):
 # --- unions ----------------------------------------------------------------------------------------------
 
 
-def test_two_boxes_overlap_in_a_known_volume():
+def test_the_union_of_two_boxes_has_the_exact_volume():
     mesh, owner = unite([box((0, 0, 0), (1, 1, 1)), box((0.5, 0.5, 0.5), (1.5, 1.5, 1.5))], [7, 3])
     stats = topology(mesh)
     assert is_closed(mesh) and stats["genus"] == 0 and stats["components"] == 1
@@ -80,7 +79,7 @@ def test_two_boxes_overlap_in_a_known_volume():
     assert set(owner) == {3, 7}
 
 
-def test_two_octahedra_overlap_in_a_known_volume():
+def test_the_union_of_two_octahedra_has_the_exact_volume():
     # |x| + |y| + |z| <= 1 and its copy moved by d along x meet in two caps of half-axis 1 - d / 2: pyramids back to
     # back.
     d = 0.6
@@ -99,7 +98,7 @@ def test_every_face_lies_on_its_primitive():
     assert np.abs((np.abs(local) / primitives.extent[owner]).sum(1) - 1).max() < 1e-6
 
 
-def test_a_union_in_groups_is_the_union_in_one_call():
+def test_a_union_in_groups_equals_the_union_in_one_call():
     import manifold3d
 
     pieces = [convex_piece(v) for v in octahedra(3 * GROUP).vertices]
@@ -115,19 +114,19 @@ def test_a_union_in_groups_is_the_union_in_one_call():
     [((0, 0, 0), 1), ((1, 0, 0), 2), ((1, 1, 0), 2), ((1, 1, 1), 2), ((1e-13, 0, 0), 1), ((0.5, 0, 0), 1.5)],
     ids=["same", "face", "edge", "corner", "almost the same", "half"],
 )
-def test_bodies_that_coincide_or_touch_stay_closed(move, volume):
+def test_unions_of_coincident_or_touching_boxes_are_closed(move, volume):
     mesh, _ = unite([box((0, 0, 0), (1, 1, 1)), box(move, np.add(move, 1))], [0, 1])
     assert is_closed(mesh)
     assert topology(mesh)["volume"] == pytest.approx(volume, abs=1e-11)
 
 
-def test_nothing_flat_is_a_piece():
+def test_flat_pieces_are_rejected():
     assert convex_piece(CUBE * [1, 1, 0]) is None and convex_piece(CUBE[:3]) is None
     with pytest.raises(LinprimError, match="no polyhedron has a volume"):
         unite([], [])
 
 
-def test_a_cavity_is_filled_and_a_room_keeps_its_walls():
+def test_unseen_shells_are_removed_and_seen_cavities_kept():
     walls = [
         box(np.where(np.arange(3) == axis, side, 0), np.where(np.arange(3) == axis, side + 1, 4))
         for axis in range(3)
@@ -164,7 +163,7 @@ def one_octahedron():
     return Primitives(np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)), np.ones(1), np.zeros((1, 1, 3)))
 
 
-def test_a_primitive_is_cut_at_the_plane_of_the_points():
+def test_a_primitive_is_cut_by_the_fitted_plane():
     one, points = one_octahedron(), wall_points((2, 0.3, (0, 9.0)))
     planes, met = fit_planes(one, points)
     assert met.all() and len(planes.offset) == 1
@@ -174,7 +173,7 @@ def test_a_primitive_is_cut_at_the_plane_of_the_points():
     assert rows.tolist() == [0] and pieces[0].volume() == pytest.approx(4 / 3 - 2 / 3 * 0.7**3, abs=1e-6)
 
 
-def test_outliers_do_not_move_a_plane():
+def test_plane_fits_are_robust_against_outliers():
     points = wall_points((2, 0.1, (0, 9.0)))
     far = points.position.copy()
     far[::5, 2] += 0.3
@@ -182,7 +181,7 @@ def test_outliers_do_not_move_a_plane():
     assert planes.offset[0] == pytest.approx(0.1, abs=5e-3) and planes.normal[0, 2] > 0.9999
 
 
-def test_a_convex_edge_is_cut_by_both_planes_and_a_concave_one_by_each():
+def test_convex_edges_are_cut_by_both_planes_concave_ones_separately():
     one = one_octahedron()
     convex = wall_points((2, 0.2, (0, 0.2)), (0, 0.2, (2, 0.2)))
     planes, met = fit_planes(one, convex)
@@ -195,11 +194,11 @@ def test_a_convex_edge_is_cut_by_both_planes_and_a_concave_one_by_each():
     pieces, _ = cut(one, planes, met, convex.noise)
     assert len(planes.offset) == 2 and len(pieces) == 2
     union, _ = unite(pieces, [0, 0])
-    # Nothing is missing but what is beyond both: 1 / 6 of (1 - 0.4)^3, twice for either side of y.
+    # Only what is beyond both planes is missing: 1 / 6 of (1 - 0.4)^3, twice for both sides of y.
     assert topology(union)["volume"] == pytest.approx(4 / 3 - 2 * 0.6**3 / 6, abs=1e-6)
 
 
-def test_a_primitive_without_points_is_dropped_and_one_with_its_surface_at_the_points_is_whole():
+def test_primitives_without_points_are_dropped_and_tangent_ones_kept_whole():
     pair = octahedra(1)
     pair = Primitives(
         np.array([[0.0, 0, 0], [5.0, 0, 0]]),
@@ -216,7 +215,7 @@ def test_a_primitive_without_points_is_dropped_and_one_with_its_surface_at_the_p
     assert rows.tolist() == [0] and pieces[0].volume() == pytest.approx(4 / 3, rel=1e-12)
 
 
-def test_the_core_is_inside_and_closed():
+def test_core_boxes_are_behind_the_surface_and_closed():
     # One camera straight above a plate at depth 1 that fills its image; the box reaches to depth 2.
     camera = Camera(32, 32, 16.0, 16.0, 16.0, 16.0, np.eye(4))
     boxes = core_boxes(
@@ -232,7 +231,7 @@ def test_the_core_is_inside_and_closed():
 # --- runs ------------------------------------------------------------------------------------------------
 
 
-def test_the_surface_of_an_opaque_octahedron_is_the_octahedron(solid):
+def test_the_surface_of_an_opaque_octahedron_is_exact(solid):
     mesh, primitive, about = traced(solid)
     reference = load_mesh(solid.parent / "scene" / "reference.ply")
     truth = topology(reference)
@@ -245,7 +244,7 @@ def test_the_surface_of_an_opaque_octahedron_is_the_octahedron(solid):
     assert np.abs(mesh.vertices.mean(0) - CENTER).max() < 1e-5
 
 
-def test_what_extract_mesh_writes(solid, tmp_path):
+def test_extract_mesh_writes_a_closed_mesh_with_attributes(solid, tmp_path):
     stats = extract_mesh(solid, "polyhedra", tmp_path / "m.ply", quiet=True)
     mesh = load_mesh(tmp_path / "m.ply")
     assert stats["watertight"] and is_closed(mesh) and stats["method"] == "polyhedra"
@@ -260,7 +259,7 @@ def test_a_soft_octahedron_is_cut_back(tmp_path):
     assert volumes[1] < 0.95 * volumes[0]
 
 
-def test_many_octahedra_are_closed_and_traced(tmp_path):
+def test_a_union_of_many_octahedra_is_closed_and_traced(tmp_path):
     # Sixty opaque ones on a sphere, each in view, neighbours overlapping by their tips. A training would put others
     # there with every seed and processor.
     count, random = 60, np.random.default_rng(0)
@@ -283,11 +282,11 @@ def test_many_octahedra_are_closed_and_traced(tmp_path):
     middle, rows = mesh.vertices[mesh.faces[owned]].mean(1), primitive[owned]
     normals, offsets = face_planes(primitives)
     ahead = np.einsum("fki,fi->fk", normals[rows], middle - primitives.center[rows].astype(float)) - offsets[rows]
-    # On the primitive, or inside it where it was cut; to get rid of a sliver the surface may move by the tolerance.
+    # Faces are on or inside their primitive, up to the tolerance by which slivers are removed.
     assert ahead.max() < 2 * about["tolerance"]
 
 
-def test_the_file_says_which_primitive_a_face_is_a_part_of(tiny_run, tmp_path):
+def test_files_contain_the_primitive_of_each_face(tiny_run, tmp_path):
     import pymeshlab
     import trimesh
 
@@ -323,13 +322,13 @@ def test_the_order_of_the_primitives_does_not_matter(tiny_run, tmp_path):
     assert (shuffle[moved[owned]] == owner[owned]).all() and (moved[~owned] == NO_PRIMITIVE).all()
 
 
-def test_the_same_run_gives_the_same_bytes(tiny_run, tmp_path):
+def test_extraction_is_reproducible(tiny_run, tmp_path):
     for name in ("a", "b"):
         extract_mesh(tiny_run, "polyhedra", tmp_path / f"{name}.ply", quiet=True)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_depths_that_do_not_fit_are_rendered_again_and_give_the_same_bytes(tiny_run, tmp_path, monkeypatch):
+def test_depths_rendered_again_give_the_same_mesh(tiny_run, tmp_path, monkeypatch):
     held = []
 
     class Watched(method_polyhedra.LevelDepths):
@@ -356,7 +355,7 @@ def test_an_unseen_body_inside_is_removed(solid, tmp_path):
     assert is_closed(mesh) and len(mesh.faces) == 8 and len(set(primitive)) == 1
 
 
-def test_what_cannot_become_a_surface_is_one_sentence(solid, tmp_path):
+def test_runs_without_a_surface_are_refused(solid, tmp_path):
     gaussians = with_primitives(
         solid, tmp_path / "g", lambda p: replace(p, density=np.full(len(p), 0.9), kind="gaussian")
     )
@@ -369,14 +368,14 @@ def test_what_cannot_become_a_surface_is_one_sentence(solid, tmp_path):
         with_primitives(solid, tmp_path / "n", lambda p: replace(p, center=p.center * np.nan))
 
 
-def test_a_speck_of_one_pixel_is_one_sentence(solid, tmp_path):
+def test_a_surface_smaller_than_a_pixel_is_refused(solid, tmp_path):
     speck = with_primitives(solid, tmp_path / "s", lambda p: replace(p, extent=p.extent * 0.04, density=p.density * 25))
     with pytest.raises(LinprimError, match="no pixel.*four neighbours"):
         traced(speck)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1e6])
-def test_points_within_bodies_are_those_that_all_planes_say(shift):
+def test_points_within_agrees_with_numpy(shift):
     random = np.random.default_rng(3)
     bodies = octahedra(60, size=0.3)
     normal, offset = face_planes(bodies)

@@ -1,4 +1,4 @@
-"""The surface fused in parts is the whole one's to the last bit, and says what it cannot do."""
+"""Fusion in parts gives the same bits as fusion of the whole, and refuses invalid options."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def parts_of(run: Path, lattice: Lattice, owner: np.ndarray, folder: Path) -> li
 
 
 @pytest.mark.parametrize("kind", ["boxes", "scattered"])
-def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, tmp_path):
+def test_merged_parts_equal_the_whole_bit_for_bit(kind, tiny_run, lattice, tmp_path):
     made, whole = lattice
     if kind == "boxes":
         owner = owners(made, 5)
@@ -71,7 +71,7 @@ def test_parts_are_together_the_whole_to_the_last_bit(kind, tiny_run, lattice, t
     assert sum(len(part.faces) for part in parts) == len(whole.faces)  # nothing twice
 
 
-def test_a_part_without_its_neighbours_would_leave_a_seam(tiny_run, lattice, tmp_path):
+def test_parts_without_a_halo_leave_seams(tiny_run, lattice, tmp_path):
     made, whole = lattice
     owner = owners(made, 2)
     faces = 0
@@ -82,7 +82,7 @@ def test_a_part_without_its_neighbours_would_leave_a_seam(tiny_run, lattice, tmp
     assert faces < len(whole.faces)
 
 
-def test_owners_share_the_blocks_and_halos_touch_them(lattice):
+def test_owners_are_balanced_and_halos_contain_adjacent_blocks(lattice):
     made = lattice[0]
     owner = owners(made, 4)
     counts = np.bincount(owner, minlength=4)
@@ -97,7 +97,7 @@ def test_owners_share_the_blocks_and_halos_touch_them(lattice):
         assert (made.levels > 0).any() or np.array_equal(near, touch)
 
 
-def test_a_lattice_comes_back_from_its_file(lattice, tmp_path):
+def test_a_lattice_survives_a_round_trip(lattice, tmp_path):
     made, owner = lattice[0], owners(lattice[0], 3)
     save_lattice(tmp_path / "lattice.npz", made, owner)
     found, other = load_lattice(tmp_path / "lattice.npz")
@@ -112,7 +112,7 @@ def test_a_lattice_comes_back_from_its_file(lattice, tmp_path):
         load_part(tmp_path / "part.npz")
 
 
-def test_the_command_gives_the_same_files_in_parts(run_copy, tmp_path):
+def test_extraction_in_parts_writes_the_same_files(run_copy, tmp_path):
     options = ExtractOptions(level=LEVEL, refine=0)
     files = [tmp_path / name / "mesh.ply" for name in ("whole", "parts")]
     extract_mesh(run_copy, output=files[0], options=options, quiet=True)
@@ -123,7 +123,7 @@ def test_the_command_gives_the_same_files_in_parts(run_copy, tmp_path):
     assert sorted(path.name for path in (run_copy / "mesh" / "tsdf").iterdir()) == ["stats.json"]
 
 
-def test_parts_that_are_done_are_not_done_again_and_those_of_other_options_go(run_copy, monkeypatch, tmp_path):
+def test_finished_parts_are_reused_and_those_of_other_options_removed(run_copy, monkeypatch, tmp_path):
     options = ExtractOptions(level=LEVEL, refine=0)
     folder = run_copy / "mesh" / "tsdf" / "parts"
     monkeypatch.setattr("linprim_geo.surface.extract.open_executor", Here)
@@ -149,6 +149,6 @@ def test_parts_that_are_done_are_not_done_again_and_those_of_other_options_go(ru
         ({"blocks": 2, "options": ExtractOptions(level=LEVEL, voxel_size=1e-5)}, "voxel size 1e-05 is less than"),
     ],
 )
-def test_what_cannot_be_is_one_sentence(how, sentence, run_copy):
+def test_invalid_options_are_refused(how, sentence, run_copy):
     with pytest.raises(LinprimError, match=sentence):
         extract_mesh(run_copy, quiet=True, **how)

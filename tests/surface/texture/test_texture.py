@@ -1,5 +1,4 @@
-"""Textures against scenes whose colour is known at every point, charts on every kind of mesh, and files as trimesh
-reads them."""
+"""Textures of a scene with known colours, charts of various meshes, and files as trimesh reads them."""
 
 from __future__ import annotations
 
@@ -47,14 +46,14 @@ def lookup(texture, faces, weights):
 
 
 def anywhere(mesh, count=20_000, seed=0):
-    """Faces (N,) and weights (N, 3) of points spread over the mesh."""
+    """Faces (N,) and barycentric weights (N, 3) of random points on the mesh."""
     rng = np.random.default_rng(seed)
     return rng.integers(len(mesh.faces), size=count), rng.dirichlet([1, 1, 1], count)
 
 
 @pytest.fixture(scope="module")
 def ball(tmp_path_factory):
-    """(mesh, views, truth(faces, weights) -> colours 0 to 255): 24 photographs of a painted ball over nothing."""
+    """(mesh, views, truth(faces, weights) -> colours 0 to 255) of 24 masked photographs of a painted ball."""
     mesh = sphere(rounds=3)
     albedo = procedural_albedo(np.zeros(len(mesh.faces), np.int32), detail=2.0)
     painted = TexturedMesh("ball", mesh.vertices, mesh.faces, np.zeros(len(mesh.faces), np.int32), albedo, "sphere")
@@ -73,7 +72,7 @@ def ball_texture(ball):
     return make_texture(ball[0], SIZE, ball[1])
 
 
-def test_the_texture_is_the_paint_and_sharper_than_vertex_colours(ball, ball_texture):
+def test_the_texture_agrees_with_the_paint_better_than_vertex_colours(ball, ball_texture):
     mesh, views, truth = ball
     faces, weights = anywhere(mesh)
     paint = truth(faces, weights)
@@ -85,7 +84,7 @@ def test_the_texture_is_the_paint_and_sharper_than_vertex_colours(ball, ball_tex
     assert ball_texture.about["texels_seen"] == 1.0 and ball_texture.about["texels_seen_well"] > 0.99
 
 
-def test_a_spoiled_photograph_does_not_show(ball, ball_texture):
+def test_one_wrong_photograph_does_not_change_the_texture(ball, ball_texture):
     mesh, views, _ = ball
     spoiled = [SimpleNamespace(camera=view.camera, load=view.load) for view in views]
     photo = views[4].load()
@@ -94,7 +93,7 @@ def test_a_spoiled_photograph_does_not_show(ball, ball_texture):
     assert np.abs(again.image.astype(int) - ball_texture.image).mean() < 2
 
 
-def test_exposure_that_drifts_does_not_show(ball, ball_texture):
+def test_known_exposure_gains_are_compensated(ball, ball_texture):
     mesh, views, _ = ball
     gains = np.linspace(0.8, 1.0, len(views))
 
@@ -112,7 +111,7 @@ def test_exposure_that_drifts_does_not_show(ball, ball_texture):
 
 
 @pytest.mark.parametrize("with_alpha", [True, False])
-def test_pixels_of_the_background_are_not_used_where_alpha_says_so(ball, with_alpha):
+def test_background_pixels_are_not_used_with_alpha(ball, with_alpha):
     mesh, views, _ = ball
     # The mesh is larger than the ball, so its silhouette lies in front of the background, which is red here.
     larger, red = replace(mesh, vertices=1.05 * mesh.vertices), []
@@ -132,7 +131,7 @@ def test_pixels_of_the_background_are_not_used_where_alpha_says_so(ball, with_al
     assert texture.about["texels_seen"] < 0.9
 
 
-def test_what_no_view_sees_has_the_colours_of_the_vertices(ball):
+def test_unseen_texels_take_vertex_colours(ball):
     mesh, views, _ = ball
     both = join(mesh, replace(mesh, vertices=0.3 * mesh.vertices))
     inner = np.arange(len(both.faces)) >= len(mesh.faces)
@@ -147,7 +146,7 @@ def test_what_no_view_sees_has_the_colours_of_the_vertices(ball):
     assert lookup(uncolored, faces, weights)[inner[faces]].min() > 5
 
 
-def test_texels_between_charts_have_a_colour_of_a_chart(ball_texture):
+def test_texels_between_charts_take_colours_of_charts(ball_texture):
     owner = texture_raster._rasterize(np.stack([ball_texture.uv[..., 0], 1 - ball_texture.uv[..., 1]], 2) * SIZE, SIZE)
     inside = (owner >= 0).reshape(SIZE, SIZE)
     assert 0.3 < inside.mean() < 0.95
@@ -155,7 +154,7 @@ def test_texels_between_charts_have_a_colour_of_a_chart(ball_texture):
     assert {tuple(color) for color in ball_texture.image[~inside]} <= known
 
 
-def test_the_passes_and_kept_photographs_do_not_change_the_texture(ball, ball_texture, monkeypatch):
+def test_the_texture_does_not_depend_on_passes_or_caching(ball, ball_texture, monkeypatch):
     monkeypatch.setattr(texture_module, "TEXELS_PER_PASS", 10_000)
     monkeypatch.setattr(texture_raster, "CANDIDATES", 5_000)
     monkeypatch.setattr(texture_module, "KEPT_BYTES", 0)
@@ -169,7 +168,7 @@ def test_the_passes_and_kept_photographs_do_not_change_the_texture(ball, ball_te
 
 
 def ramp(turns=3, steps=24):
-    """A spiral ramp: one connected piece that looks up everywhere and lies over itself."""
+    """A spiral ramp: one connected piece that faces up everywhere and overlaps itself from above."""
     angle = np.linspace(0, 2 * np.pi * turns, turns * steps + 1)
     rings = [np.stack([r * np.cos(angle), r * np.sin(angle), 0.1 * angle], 1) for r in (0.5, 1.0)]
     a = np.arange(len(angle) - 1)
@@ -198,7 +197,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_no_texel_is_inside_two_faces_of_any_mesh(name):
+def test_charts_do_not_overlap(name):
     mesh, size = CASES[name], 96
     corners, charts = unwrap(mesh, size)
     assert corners.shape == (len(mesh.faces), 3, 2) and np.isfinite(corners).all() and 1 <= charts <= len(mesh.faces)
@@ -211,7 +210,7 @@ def test_no_texel_is_inside_two_faces_of_any_mesh(name):
     assert inside.max() == 1
 
 
-def test_a_face_keeps_most_of_its_area_and_a_flat_one_its_shape():
+def test_unwrapping_limits_the_distortion_of_area():
     corners, charts = unwrap(CASES["flat"], 128)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     world = CASES["flat"].vertices[CASES["flat"].faces]
@@ -225,11 +224,11 @@ def test_a_face_keeps_most_of_its_area_and_a_flat_one_its_shape():
         np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2))), axis=1
     )
     share = flat / solid
-    # Faces are at worst LEAST_COSINE from across their plane, which their area is multiplied by.
+    # Projection multiplies the area of a face by at least LEAST_COSINE.
     assert share.min() / share.max() > texture_charts.LEAST_COSINE * 0.99 and charts <= 12
 
 
-def test_too_many_charts_and_unusable_meshes_are_one_sentence(ball):
+def test_too_many_charts_and_invalid_meshes_are_refused(ball):
     views = ball[1]
     with pytest.raises(LinprimError, match="charts of 80 faces do not fit.*16x16.*--target-faces"):
         make_texture(CASES["soup"], 16, views)
@@ -240,7 +239,7 @@ def test_too_many_charts_and_unusable_meshes_are_one_sentence(ball):
             make_texture(mesh, 64, views)
 
 
-def test_faces_with_few_texels_are_said(ball):
+def test_faces_with_few_texels_are_reported(ball):
     lines = []
     make_texture(ball[0], 48, ball[1][:2], note=lines.append)
     assert len(lines) == 2 and "512 faces" in lines[0] and "--target-faces" in lines[1]
@@ -277,7 +276,7 @@ def test_files_load_with_the_same_uv_and_image(suffix, far, ball, ball_texture, 
         assert text.count("\nv ") == len(mesh.vertices) == text.count("\nvn ")
 
 
-def test_a_part_of_the_faces_keeps_its_texture(ball, ball_texture, tmp_path):
+def test_selected_faces_keep_their_texture(ball, ball_texture, tmp_path):
     half = ball[0].vertices[ball[0].faces].mean(1)[:, 2] > 0
     part = ball_texture.select(half)
     save_textured(tmp_path / "half.glb", select_faces(ball[0], half), part)
@@ -285,7 +284,7 @@ def test_a_part_of_the_faces_keeps_its_texture(ball, ball_texture, tmp_path):
     np.testing.assert_array_equal(part.uv, ball_texture.uv[half])
 
 
-def test_only_obj_and_glb_hold_a_texture(ball, ball_texture, tmp_path):
+def test_textures_in_other_formats_than_obj_and_glb_are_refused(ball, ball_texture, tmp_path):
     for suffix in (".ply", ".stl"):
         with pytest.raises(LinprimError, match=f"{suffix} files hold no texture, wanted .obj or .glb"):
             save_textured(tmp_path / f"m{suffix}", ball[0], ball_texture)
@@ -308,7 +307,7 @@ def test_extraction_writes_textures(solid, tmp_path):
         assert np.abs(np.median(load_mesh(tmp_path / name).colors, 0) - 178).max() <= 2
 
 
-def test_a_texture_that_cannot_be_is_refused_before_anything_is_rendered(solid, tmp_path, monkeypatch):
+def test_invalid_textures_are_refused_before_rendering(solid, tmp_path, monkeypatch):
     monkeypatch.setattr(Run, "render_views", lambda *_, **__: pytest.fail("rendered"))
     for output, size, match in (
         (None, 128, r"mesh.ply: .ply files hold no texture, wanted .obj or .glb"),
