@@ -1,4 +1,4 @@
-"""What counts as a plain backdrop."""
+"""Detection of a plain backdrop by colours and points at image borders."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ WIDTH, HEIGHT, VIEWS = 160, 120, 5
 
 
 def capture(folder, seed, points, kind=PointCloud, greys=(120,) * VIEWS) -> Scene:
-    """Photographs of something colourful before a grey that varies a little, and points at these (N, 2) pixels."""
+    """Photographs of a colourful object in front of a nearly uniform grey, and points at these (N, 2) pixels."""
     rng, views = np.random.default_rng(seed), []
     for k, grey in enumerate(greys):
         rgb = rng.normal(grey, 6, (HEIGHT, WIDTH, 3))
@@ -32,25 +32,25 @@ def on_object(rng, count=300):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_backdrop_of_one_colour_is_plain_despite_some_wrong_points(tmp_path, seed):
+def test_a_uniform_backdrop_with_a_few_wrong_points_is_plain(tmp_path, seed):
     rng = np.random.default_rng(seed)
     wrong = rng.uniform([0, 0], [WIDTH, HEIGHT], (8, 2))
     assert plain_border(capture(tmp_path, seed, np.concatenate([on_object(rng), wrong]))) > BACKDROP_SHARE
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_carpet_of_one_colour_has_points_and_is_no_backdrop(tmp_path, seed):
+def test_a_uniform_carpet_with_points_is_no_backdrop(tmp_path, seed):
     rng = np.random.default_rng(seed)
     carpet = rng.uniform([0, 0], [WIDTH, HEIGHT], (800, 2))  # half as dense as the object
     assert plain_border(capture(tmp_path, seed, np.concatenate([on_object(rng), carpet]))) < 0.3
 
 
-def test_without_points_of_surfaces_the_colour_decides(tmp_path):
+def test_colour_decides_without_surface_points(tmp_path):
     everywhere = np.random.default_rng(0).uniform([0, 0], [WIDTH, HEIGHT], (400, 2))
     for points, kind in ((everywhere, VolumePoints), (np.zeros((0, 2)), PointCloud)):
         assert plain_border(capture(tmp_path, 0, points, kind)) > 0.95
 
 
-def test_colours_that_differ_are_no_backdrop(tmp_path):
+def test_different_colours_are_no_backdrop(tmp_path):
     scene = capture(tmp_path, 0, np.zeros((0, 2)), greys=(60, 90, 120, 150, 180))
     assert plain_border(scene) < 0.5

@@ -1,4 +1,4 @@
-"""What a block is trained on: windows of the photographs, and the frozen scene round it."""
+"""Training images of a block: windows of photographs, and the frozen scene around it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import RECENT, LazyTrainingImage, TrainingImage
 
 
-def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(blocks_run):
+def test_block_images_show_photographs_in_the_block_and_frozen_renders_outside(blocks_run):
     run = Run.open(blocks_run[0])
     scene, coarse = run.scene(), Run.open(blocks_run[0] / "blocks" / "coarse" / "run")
     everything = Block((-np.inf,) * 3, (np.inf,) * 3)
@@ -53,7 +53,7 @@ def test_a_block_sees_its_own_pixels_and_the_frozen_scene_elsewhere(blocks_run):
     assert all(image.size == (48, 48) for image in images)
 
 
-def test_windows_are_in_no_memory_and_leave_no_file(blocks_run, tmp_path, monkeypatch):
+def test_windows_are_read_on_demand_and_leave_no_file(blocks_run, tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     run = Run.open(blocks_run[0])
     scene, coarse = run.scene(), Run.open(blocks_run[0] / "blocks" / "coarse" / "run")
@@ -78,7 +78,7 @@ def test_windows_are_in_no_memory_and_leave_no_file(blocks_run, tmp_path, monkey
 
 
 @pytest.mark.parametrize("population", ["gradient", "3dgs"])
-def test_a_window_pulls_as_its_photograph_does(population):
+def test_gradients_of_a_window_equal_those_of_its_photograph(population):
     rng = np.random.default_rng(0)
     reach = np.array([0.3, 0.15, 0.3])
     start = initial_parameters(rng.uniform(-reach, reach, (40, 3)), rng.integers(0, 255, (40, 3)), 0, 0, (0.01, 0.1))
@@ -102,7 +102,7 @@ def test_a_window_pulls_as_its_photograph_does(population):
     )
 
 
-def test_frozen_primitives_are_drawn_and_stay(blocks_run):
+def test_frozen_primitives_are_rendered_and_not_trained(blocks_run):
     run = Run.open(blocks_run[0])
     scene, coarse = run.scene(), Run.open(blocks_run[0] / "blocks" / "coarse" / "run")
     own = read_plan(run.path).blocks[0].block

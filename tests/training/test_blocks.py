@@ -1,4 +1,4 @@
-"""A scene trained in blocks is a run like any other; one block is today's path."""
+"""Training in blocks: the result is a usual run, and one block equals training without blocks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from linprim_geo.training.blocks.tasks import block_folder, join_task, outside
 from linprim_geo.training.train import train
 
 
-def test_the_run_renders_extracts_and_scores_as_any_other(blocks_run, tmp_path):
+def test_a_run_in_blocks_can_be_rendered_extracted_and_scored(blocks_run, tmp_path):
     run, done = blocks_run
     opened = Run.open(run)
     # Measured (see tests/README.md): 22.48 to 23.02 dB.
@@ -48,7 +48,7 @@ def test_the_run_renders_extracts_and_scores_as_any_other(blocks_run, tmp_path):
     assert 0.1 < done["block_peak_gib"] < 4
 
 
-def test_every_block_keeps_what_it_owns(blocks_run):
+def test_blocks_keep_owned_primitives_and_drop_margins(blocks_run):
     run, done = blocks_run
     plan = read_plan(run)
     kept = []
@@ -57,7 +57,7 @@ def test_every_block_keeps_what_it_owns(blocks_run):
             load_primitives(block_folder(run, k, at) / "run" / "training_frame.npz") for at in (0, len(EXCHANGES))
         )
         own = plan.blocks[k].block.holds(begun.center)
-        assert 0 < own.sum() < len(begun)  # the margin is trained and dropped
+        assert 0 < own.sum() < len(begun)  # primitives in the margin are dropped
         neighbour = load_primitives(block_folder(run, 1 - k) / "run" / "training_frame.npz").center
         beside = plan.blocks[1 - k].block.holds(neighbour) & plan.blocks[k].block.holds(neighbour, plan.margin)
         after = load_primitives(block_folder(run, k, 1) / "run" / "training_frame.npz").center
@@ -70,7 +70,7 @@ def test_every_block_keeps_what_it_owns(blocks_run):
 
 
 @pytest.mark.parametrize("lost", [(0,), (0, 1)])
-def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, blocks_run, tmp_path, monkeypatch):
+def test_a_block_without_owned_primitives_adds_none(lost, blocks_run, tmp_path, monkeypatch):
     run, is_owned = blocks_run[0], block_tasks.is_owned
     monkeypatch.setattr(
         block_tasks, "is_owned", lambda run, plan, k, at, state: is_owned(run, plan, k, at, state) & (k not in lost)
@@ -79,7 +79,7 @@ def test_a_block_that_has_lost_all_it_owned_adds_nothing(lost, blocks_run, tmp_p
     assert result["owned"] == 0 < result["primitives"]
 
 
-def test_a_plan_comes_back_from_its_file(blocks_run):
+def test_a_plan_survives_a_round_trip(blocks_run):
     saved = worker.result_of_folder(blocks_run[0] / "blocks" / "plan")
     found = plan.Plan.from_json(saved, blocks_run[0])
     assert json.loads(json.dumps(found.to_json(), allow_nan=False)).items() <= saved.items()
@@ -87,7 +87,7 @@ def test_a_plan_comes_back_from_its_file(blocks_run):
     assert math.inf in ends and -math.inf in ends and plan.Plan.from_json(found.to_json(), blocks_run[0]) == found
 
 
-def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
+def test_exact_radius_is_limited_by_the_number_of_primitives(monkeypatch):
     distances = np.concatenate([np.zeros(100), np.linspace(0.01, 9.0, 900)])
     assert exact_radius_of(distances, 0.5, 100_000) == np.inf  # 90,000 lie outside
     monkeypatch.setattr(plan, "MOST_BESIDE", 10_000)
@@ -95,7 +95,7 @@ def test_the_nearest_that_memory_allows_stand_in_full(monkeypatch):
     assert exact_radius_of(distances, 2.0, 100_000) == 2.0
 
 
-def test_others_stand_in_full_as_far_as_they_are_known(blocks_run, tmp_path, monkeypatch):
+def test_primitives_of_neighbours_are_frozen_within_the_exact_radius(blocks_run, tmp_path, monkeypatch):
     run, taken = blocks_run[0], {}
     plan = read_plan(run)
     own, other, margin = plan.blocks[0].block, plan.blocks[1].block, plan.margin
@@ -124,13 +124,13 @@ def test_others_stand_in_full_as_far_as_they_are_known(blocks_run, tmp_path, mon
 
 @pytest.fixture
 def run_alone(blocks_run):
-    """`blocks_run`, which no other process of the tests resumes in the meantime."""
+    """`blocks_run`, locked against other test processes that resume it."""
     with locked(blocks_run[0].parent, "resumed", "resumed", wait=lambda: None):
         yield blocks_run
 
 
-def test_a_coarse_scene_of_few_photographs_goes_on_as_it_began(tmp_path, monkeypatch):
-    """What is chosen by their number when it starts is kept when it is resumed."""
+def test_a_resumed_coarse_scene_of_few_photographs_repeats_the_run(tmp_path, monkeypatch):
+    """Options that depend on the number of photographs are kept when the run is resumed."""
     options = replace(OPTIONS, checkpoint_every=10)
     synthesize(tmp_path / "few", shape="cad", views=8, test_views=2, size=64, points=400, supersample=1)
     monkeypatch.setattr(block_training, "open_executor", Here)
@@ -155,7 +155,7 @@ def test_a_coarse_scene_of_few_photographs_goes_on_as_it_began(tmp_path, monkeyp
     assert_same(tmp_path / "stopped", tmp_path / "whole")
 
 
-def test_a_run_begun_by_another_version_is_one_sentence(run_alone, tiny_scene, monkeypatch):
+def test_a_run_of_another_format_is_refused(run_alone, tiny_scene, monkeypatch):
     monkeypatch.setattr(plan, "FORMAT", 1)
     with pytest.raises(
         LinprimError, match="was begun in blocks by another version of linprim-geo, wanted a new folder"
@@ -163,7 +163,7 @@ def test_a_run_begun_by_another_version_is_one_sentence(run_alone, tiny_scene, m
         train(tiny_scene, run_alone[0], options=OPTIONS, resume=True, quiet=True)
 
 
-def test_own_primitives_are_limited_to_what_is_asked_for(blocks_run):
+def test_owned_primitives_are_limited_by_max_primitives(blocks_run):
     run, done = blocks_run
     plan = read_plan(run)
     assert sum(part.own_primitives for part in plan.blocks) == OPTIONS.max_primitives
@@ -174,13 +174,13 @@ def test_own_primitives_are_limited_to_what_is_asked_for(blocks_run):
     assert apportioned([1, 1, 1], 10) == [4, 3, 3] and apportioned([0, 5, 2], 70) == [0, 50, 20]
 
 
-def test_so_few_steps_that_none_are_left_after_an_exchange(tiny_scene, tmp_path, monkeypatch):
+def test_training_works_without_steps_after_an_exchange(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(block_training, "open_executor", Here)
     done = train_blocks(tiny_scene, tmp_path / "run", options=replace(OPTIONS, iterations=5), blocks=COUNT, quiet=True)
     assert done["iterations"] == 5 and done["primitives"] > 20 and done["psnr"] > 5
 
 
-def test_a_finished_run_is_not_done_again(run_alone, tiny_scene):
+def test_resuming_a_finished_run_repeats_no_work(run_alone, tiny_scene):
     run, done = run_alone
     before = {path: path.stat().st_mtime_ns for path in run.glob(f"blocks/*/{worker.DONE}")}
     again = train(tiny_scene, run, options=OPTIONS, resume=True, quiet=True)
@@ -192,9 +192,8 @@ def test_a_finished_run_is_not_done_again(run_alone, tiny_scene):
 
 
 @pytest.mark.parametrize(("blocks", "ignored"), [(3, ["--blocks"]), ("auto", ["--blocks"]), (COUNT, []), (1, [])])
-def test_another_number_of_blocks_is_named_as_ignored(blocks, ignored, run_alone, tiny_scene, monkeypatch, capsys):
-    """The number that it was begun with, and 1, which is also that of nobody who says none, are not; --workers and
-    --cluster are taken."""
+def test_resuming_reports_another_number_of_blocks(blocks, ignored, run_alone, tiny_scene, monkeypatch, capsys):
+    """The original number and 1, which is also the default, are not reported. --workers and --cluster are used."""
     called = []
 
     def executor(cluster, shared, workers):
@@ -211,7 +210,7 @@ def test_another_number_of_blocks_is_named_as_ignored(blocks, ignored, run_alone
 
 
 @pytest.mark.parametrize("blocks", ["1", "auto"])
-def test_what_fits_one_block_is_trained_as_it_always_was(blocks, tiny_scene, tmp_path):
+def test_one_block_equals_training_without_blocks(blocks, tiny_scene, tmp_path):
     short = replace(OPTIONS, iterations=30)
     train(tiny_scene, tmp_path / "always", options=short, quiet=True)
     arguments = ["--iterations", "30", *ARGUMENTS[2:]]
@@ -220,7 +219,7 @@ def test_what_fits_one_block_is_trained_as_it_always_was(blocks, tiny_scene, tmp
     assert not (tmp_path / "run" / "blocks").exists() and "blocks" not in Run.open(tmp_path / "run").notes
 
 
-def test_auto_takes_as_many_blocks_as_memory_asks_for(tiny_scene, tmp_path):
+def test_blocks_auto_follows_from_memory(tiny_scene, tmp_path):
     views = load_scene(tiny_scene).train
     large = replace(OPTIONS, max_primitives=4_000_000)
     with Processes(tmp_path, 1) as executor:
@@ -235,7 +234,7 @@ def test_auto_takes_as_many_blocks_as_memory_asks_for(tiny_scene, tmp_path):
             blocks_that_fit(views, large, executor)
 
 
-def test_a_run_of_one_block_is_not_resumed_in_several(tiny_run, tiny_scene):
+def test_resuming_a_single_run_in_blocks_is_refused(tiny_run, tiny_scene):
     before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
     with pytest.raises(LinprimError, match="was not begun in blocks, wanted --resume without --blocks"):
         train(tiny_scene, tiny_run, blocks=2, resume=True, quiet=True)
@@ -251,20 +250,20 @@ def test_a_run_of_one_block_is_not_resumed_in_several(tiny_run, tiny_scene):
         ({}, 0, "--blocks is 0, wanted auto, or a number from 1"),
     ],
 )
-def test_what_blocks_cannot_do_is_one_sentence(options, blocks, sentence, tiny_scene, tmp_path):
+def test_options_that_exclude_blocks_are_refused(options, blocks, sentence, tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match=sentence):
         train(tiny_scene, tmp_path / "run", options=replace(OPTIONS, **options), blocks=blocks, quiet=True)
     assert not (tmp_path / "run").exists()
 
 
-def test_blocks_that_no_camera_sees_are_one_sentence(blocks_run, monkeypatch):
+def test_blocks_without_cameras_are_refused(blocks_run, monkeypatch):
     run, _ = blocks_run
     monkeypatch.setattr(plan, "window", lambda *_: None)
     with pytest.raises(LinprimError, match="block 0 of 2 is seen by 0 cameras, wanted two at least: fewer blocks"):
         plan.plan_task(run / "blocks" / "plan", str(run), 2)
 
 
-def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, capsys):
+def test_command_line_options_that_exclude_blocks_are_refused(tiny_scene, tmp_path, capsys):
     for arguments, sentence in (
         (["--blocks", "2", "--time-budget", "5m"], "--time-budget plans one training"),
         (["--cluster", "local"], "there is one block, which is done here: wanted --blocks as well"),
@@ -277,7 +276,7 @@ def test_a_time_budget_and_a_lone_cluster_are_refused(tiny_scene, tmp_path, caps
     assert not (tmp_path / "run").exists()
 
 
-def test_the_result_has_the_line_of_a_table(blocks_run):
+def test_metrics_have_one_line_with_the_result(blocks_run):
     (line,) = [json.loads(text) for text in (blocks_run[0] / "metrics.jsonl").read_text().splitlines()]
     assert (
         line["step"] == OPTIONS.iterations

@@ -1,4 +1,4 @@
-"""A training in blocks, killed anywhere, ends in the same bits; one that is asked to end lets its workers save."""
+"""Training in blocks gives the same bits after random kills, and ends its workers on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from helpers.executor_tasks import is_alive
 
 
 def workers_of(driver: int) -> list[int]:
-    """Processes below a driver that do tasks, of either engine."""
+    """Worker processes of a driver, for either executor."""
     parents, found = {}, []
     for entry in Path("/proc").iterdir():
         try:
@@ -82,7 +82,7 @@ def train_killed_at_random(
             return drivers
 
 
-def test_killed_at_random_moments_it_ends_in_the_same_bits(blocks_run, tiny_scene, tmp_path):
+def test_random_kills_do_not_change_the_result(blocks_run, tiny_scene, tmp_path):
     run = tmp_path / "run"
     train_killed_at_random(tiny_scene, run, 3, random.Random(5), 3.0)
     assert_same(run, blocks_run[0])
@@ -91,7 +91,7 @@ def test_killed_at_random_moments_it_ends_in_the_same_bits(blocks_run, tiny_scen
     assert not [path for path in run.rglob(".*") if ".tmp" in path.name]
 
 
-def test_a_driver_that_is_asked_to_end_lets_its_workers_save(tiny_scene, tmp_path):
+def test_an_interrupted_driver_ends_its_workers(tiny_scene, tmp_path):
     run = tmp_path / "run"
     # What starts the tests may ignore Ctrl-C, which a process inherits.
     program = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
@@ -115,7 +115,7 @@ def test_a_driver_that_is_asked_to_end_lets_its_workers_save(tiny_scene, tmp_pat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arguments", [[], ["--cluster", "local"]], ids=["processes", "ray"])
-def test_twenty_kills_end_in_the_same_bits(arguments, blocks_run, tiny_scene, tmp_path):
+def test_twenty_random_kills_do_not_change_the_result(arguments, blocks_run, tiny_scene, tmp_path):
     if arguments:
         pytest.importorskip("ray", reason="the extra cluster is missing")
     rng, kills = random.Random(11), 0

@@ -1,5 +1,4 @@
-"""What --dry-run says holds for the training, it writes nothing, and photographs that stay on disk train to the same
-bits."""
+"""`train --dry-run` predicts the training and writes nothing; photographs read from disk do not change the result."""
 
 from __future__ import annotations
 
@@ -40,7 +39,7 @@ def everything(folder) -> dict:
 
 
 @pytest.mark.parametrize("kept", [0, 5])
-def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, monkeypatch):
+def test_reading_photographs_from_disk_does_not_change_the_training(kept, tiny_scene, tmp_path, monkeypatch):
     options = replace(OPTIONS, exposure="gain", normal_consistency=0.1, geometry_from=0.5)
     train(tiny_scene, tmp_path / "memory", options=options, quiet=True)
     one = photo_bytes(load_scene(tiny_scene).train[:1])
@@ -64,7 +63,7 @@ def test_photographs_on_disk_train_to_the_same_bits(kept, tiny_scene, tmp_path, 
     assert scores[0] == scores[1]
 
 
-def test_a_photograph_on_disk_is_the_one_in_memory_and_few_are_kept(tiny_scene):
+def test_lazy_images_equal_those_in_memory_and_cache_few(tiny_scene):
     scene = load_scene(tiny_scene)
     from linprim_geo.points.initial_points import scene_normalization
 
@@ -78,7 +77,7 @@ def test_a_photograph_on_disk_is_the_one_in_memory_and_few_are_kept(tiny_scene):
         assert len(other._recent) <= images.RECENT
 
 
-def test_photographs_take_a_share_of_the_memory_but_not_all_of_a_large_one(monkeypatch):
+def test_the_memory_of_photographs_is_limited(monkeypatch):
     monkeypatch.setattr(images, "available_memory", lambda: 2**30)
     assert images.photo_limit() == 2**28
     monkeypatch.setattr(images, "available_memory", lambda: 2**40)
@@ -100,7 +99,7 @@ def test_a_step_reads_its_photograph_once(tiny_scene, tmp_path, monkeypatch):
     assert max(np.diff(before)) == 1
 
 
-def test_a_photograph_that_is_gone_is_named(tiny_scene, tmp_path, monkeypatch):
+def test_a_missing_photograph_is_named(tiny_scene, tmp_path, monkeypatch):
     scene = shutil.copytree(tiny_scene, tmp_path / "scene")
     monkeypatch.setattr(images, "available_memory", lambda: 0)
     advance = Trainer.advance
@@ -120,7 +119,7 @@ def test_a_photograph_that_is_gone_is_named(tiny_scene, tmp_path, monkeypatch):
 # --- --dry-run --------------------------------------------------------------------------------------------
 
 
-def test_it_says_what_training_does_and_writes_nothing(tiny_scene, tmp_path, capsys):
+def test_dry_run_predicts_the_training_and_writes_nothing(tiny_scene, tmp_path, capsys):
     before = everything(tmp_path), everything(tiny_scene)
     words = ["--iterations", "300", "--max-primitives", "400", "--threads", "1", "--dry-run"]
     assert cli.main(["--json", "train", str(tiny_scene), "-o", str(tmp_path / "run"), *words]) == 0
@@ -136,7 +135,7 @@ def test_it_says_what_training_does_and_writes_nothing(tiny_scene, tmp_path, cap
     assert begun["seconds"] / 4 < 60 * report["minutes"] < 4 * begun["seconds"] + 4
 
 
-def test_people_read_lines(tiny_scene, tmp_path, capsys):
+def test_the_command_prints_readable_lines(tiny_scene, tmp_path, capsys):
     assert (
         cli.main(
             [
@@ -170,10 +169,10 @@ def test_people_read_lines(tiny_scene, tmp_path, capsys):
     ("available", "primitives", "advice"),
     [(5.0, 100_000_000, r"--max-primitives \d+000 or less"), (0.0, 20_000, "--downscale 3 or more")],
 )
-def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advice, tiny_scene, tmp_path, monkeypatch):
+def test_trainings_that_do_not_fit_come_with_advice(available, primitives, advice, tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr("linprim_geo.capture.load.LONGEST_SIDE", 24)  # photographs are averaged down 2 by 2
     monkeypatch.setattr(dry_run, "available_memory", lambda: int(available * 2**30))
-    if available == 0:  # what is taken already is all there is
+    if available == 0:  # only memory that is already in use
         monkeypatch.setattr(dry_run, "memory_gib", lambda: 1.0)
         monkeypatch.setattr(dry_run, "peak_gib", lambda: 1.0)
     options = replace(OPTIONS, max_primitives=primitives)
@@ -189,13 +188,13 @@ def test_what_does_not_fit_comes_with_what_to_change(available, primitives, advi
         ]
 
 
-def test_photographs_that_are_read_when_they_are_due_are_said(tiny_scene, tmp_path, monkeypatch):
+def test_lazy_photographs_are_reported(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(images, "available_memory", lambda: 0)
     report = dry_run.dry_run(tiny_scene, tmp_path / "run", options=OPTIONS, quiet=True)
     assert report["photos_in_memory"] == 0 and "read when they are due" in dry_run.describe(report)
 
 
-def test_a_budget_is_planned_with(tiny_scene, tmp_path):
+def test_dry_run_plans_a_time_budget(tiny_scene, tmp_path):
     report, seconds = with_budget(
         lambda budget: dry_run.dry_run(
             tiny_scene, tmp_path / "run", options=TrainOptions(threads=1), time_budget=budget, quiet=True
@@ -205,7 +204,7 @@ def test_a_budget_is_planned_with(tiny_scene, tmp_path):
     assert report["minutes"] == seconds / 60 and report["iterations"] >= 300 and not (tmp_path / "run").exists()
 
 
-def test_what_training_refuses_it_refuses(tiny_scene, tiny_run, tmp_path):
+def test_dry_run_refuses_what_training_refuses(tiny_scene, tiny_run, tmp_path):
     with pytest.raises(LinprimError, match="exists already"):
         dry_run.dry_run(tiny_scene, tiny_run, options=OPTIONS, quiet=True)
     with pytest.raises(LinprimError, match="--iterations is 0"):

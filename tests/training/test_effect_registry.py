@@ -1,4 +1,4 @@
-"""When an effect is on: evidence a hundredth below and above each threshold, made by its closed form."""
+"""Thresholds of effects, tested with evidence 1 % below and above each, constructed in closed form."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FOCAL, SIZE, DISTANCE = 100.0, 80, 3.0
 
 
 def data(*, views=(), found=(), xyz=((0.0, 0.0, 0.0),), spacing=0.01, points=None, has_alpha=False):
-    """What detectors look at: views, what photographs say of points, and where primitives begin."""
+    """Input of detectors: views, observations of points, and start positions of primitives."""
     scene = SimpleNamespace(train=tuple(views), views=tuple(views), points=points, has_alpha=has_alpha)
     start = np.array(xyz, dtype=np.float64), np.full(len(xyz), spacing)
     observations = SimpleNamespace(**dict(found))
@@ -31,7 +31,7 @@ def data(*, views=(), found=(), xyz=((0.0, 0.0, 0.0),), spacing=0.01, points=Non
 
 
 def view(**more):
-    """A view of the origin from DISTANCE before it."""
+    """A view of the origin from DISTANCE."""
     pose = np.eye(4)
     pose[2, 3] = DISTANCE
     camera = Camera(SIZE, SIZE, FOCAL, FOCAL, SIZE / 2, SIZE / 2, pose)
@@ -70,7 +70,7 @@ def share_of(**more):
 
 
 def reaches(part: float):
-    """The smallest half-axis is 0.35 px at a distance of 3: 5e5 of them."""
+    """The smallest half-axis is 0.35 px at a distance of 3; 5e5 primitives reach the threshold."""
     return data(views=[view()], xyz=[[5e5 * part * 0.35 * 3 / FOCAL, 0.0, 0.0]])
 
 
@@ -94,7 +94,7 @@ LEFT = dict.fromkeys(("background", "environment"), {"background": "auto"})
 
 @pytest.fixture(autouse=True)
 def photographs(monkeypatch):
-    """What detectors of whole photographs find there: tests of `background` and `far_colors` say what that is."""
+    """Replace detectors of whole photographs, which are tested with `background` and `far_colors`."""
     shown: dict[str, float] = {}
     monkeypatch.setattr(effect_registry, "plain_border", lambda scene: shown["border"])
     monkeypatch.setattr(effect_registry, "far_share", lambda scene, observations: shown["far"])
@@ -111,7 +111,7 @@ def test_every_effect_has_a_case():
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_an_effect_is_on_from_its_threshold_upwards(name, photographs):
+def test_effects_are_on_above_their_threshold(name, photographs):
     effect = EFFECTS[name]
     below, above = (decided(effect, CASES[name](part), photographs) for part in (0.99, 1.01))
     assert below.value < below.threshold < above.value and above.threshold == effect.threshold
@@ -127,8 +127,8 @@ def test_an_effect_is_on_from_its_threshold_upwards(name, photographs):
 
 
 @pytest.mark.parametrize("asked", ["background", "environment"])
-def test_no_sky_is_looked_for_where_a_background_is_not_wanted(asked, photographs):
-    """Else what photographs do not call for is left to the start of the training, which may find one."""
+def test_background_is_random_if_background_or_environment_is_off(asked, photographs):
+    """With `auto` the start of the training may still find a sky."""
     settings = {**vars(SceneOptions()), **vars(TrainOptions())}
     photographs.update(border=0.0, far=0.0)
 
@@ -142,21 +142,21 @@ def test_no_sky_is_looked_for_where_a_background_is_not_wanted(asked, photograph
     assert background(Choice("auto", {asked: False})) == ("random" if asked == "background" else "fitted")
 
 
-def test_primitives_that_a_view_does_not_show_are_not_shifted_in_it():
+def test_exact_rays_ignores_primitives_outside_of_views():
     beside = (9.0, 0.0, 0.0)
     one, both = (data(views=[view()], xyz=xyz) for xyz in ([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0), beside]))
     measure = EFFECTS["exact-rays"].measure
     assert measure(both) == measure(one) > 0 and measure(data(views=[view()], xyz=[beside])) is None
 
 
-def test_the_smallest_primitive_is_that_of_the_longer_focal_length():
+def test_double_uses_the_longer_focal_length():
     usual, longer = reaches(1.0), reaches(1.0)
     longer.scene.train[0].camera = replace(longer.scene.train[0].camera, fy=2 * FOCAL)
     measure = EFFECTS["double"].measure
     assert measure(longer) == pytest.approx(2 * measure(usual))
 
 
-def test_a_lens_that_is_to_be_undistorted_is_taken_for_no_pinhole():
+def test_the_lens_effect_keeps_distortion():
     effect, lens = EFFECTS["lens"], bent_by(1.01).scene.views[0].lens
     assert straightened(lens, effect.on["pinhole_below"]) is lens
     assert straightened(lens, effect.off["pinhole_below"]).model == "PINHOLE"
@@ -180,16 +180,16 @@ def depths_of(factors: np.ndarray):
         (1 / 1.09, 100, 100),
         (1.11, 100, 0),
         (1 / 1.11, 100, 0),
-        # Behind what a map shows are many points, but not four in five.
+        # Many points may be occluded, but not more than four in five.
         (1.0, 21, 100),
         (1.0, 19, 0),
     ],
 )
-def test_depths_within_a_tenth_for_a_fifth_of_the_points_have_their_unit(factor, agreeing, share):
+def test_depth_share_needs_a_fifth_of_points_within_10_percent(factor, agreeing, share):
     factors = np.where(np.arange(100) < agreeing, factor, 0.3).reshape(10, 10)
     assert effect_registry._depth_share(depths_of(factors)) == share
 
 
-def test_pixels_without_depth_say_nothing_of_its_unit():
+def test_depth_share_ignores_pixels_without_depth():
     factors = np.where(np.arange(100) < 5, 1.0, 0.0).reshape(10, 10)
     assert effect_registry._depth_share(depths_of(factors)) == 100

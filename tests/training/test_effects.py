@@ -1,4 +1,4 @@
-"""Effects: what the detectors find in scenes with and without each of them, who decides, and what is written down."""
+"""Effects: detection in scenes with and without them, precedence of decisions, and records of runs."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def scenes(tmp_path_factory):
 
 @pytest.fixture
 def own_points(monkeypatch):
-    """Trainings start from the scene's points alone: looking for more is slow, and no matter of effects."""
+    """Use only the scene's points as start points; finding more is slow and irrelevant here."""
     monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
@@ -71,7 +71,7 @@ def decisions(scene, choice=None, options=OPTIONS, scene_options=None):
     return {decision.name: decision for decision in found}
 
 
-def test_a_plain_scene_calls_for_what_is_kept_and_for_its_masks(scenes):
+def test_a_plain_scene_uses_defaults_and_masks(scenes):
     found = decisions(scenes("plain"))
     assert list(found) == list(EFFECTS)
     assert {name for name, d in found.items() if d.on} == {"view-dependence", "exact-rays", "masks"}
@@ -96,17 +96,17 @@ def test_a_plain_scene_calls_for_what_is_kept_and_for_its_masks(scenes):
         ("room", "overlap", 50),
     ],
 )
-def test_each_effect_is_seen_where_it_is(scene, name, least, scenes):
+def test_each_effect_is_detected_in_its_scene_only(scene, name, least, scenes):
     found = decisions(scenes(scene))
     assert found[name].on and found[name].value > least and found[name].reason == "data"
     others = {"view-dependence", "exposure", "filter", "lens", "background", "overlap", "double"} - {name}
-    # Where too few points are seen often enough, the usual setting stays: that says nothing about the detector.
+    # Effects without enough observed points keep their defaults, which says nothing about their detectors.
     assert not [other for other in others if found[other].on and found[other].reason not in ("unknown", "kept")]
     assert {**found[name].options} == dict(EFFECTS[name].on)
 
 
 def looked_at(change) -> Observations:
-    """Points on a plane, 0.5 grey with noise, in 20 views in all of which `change` (P, V) is added."""
+    """Noisy points of grey 0.5 on a plane, observed in 20 views, with `change` (P, V) added."""
     rng = np.random.default_rng(0)
     side = np.arange(20.0)
     xyz = np.stack([*map(np.ravel, np.meshgrid(side, side)), np.zeros(400)], 1)
@@ -115,9 +115,9 @@ def looked_at(change) -> Observations:
     return Observations(xyz, everywhere, everywhere, color, np.full((400, 20), 0.12))
 
 
-def test_what_is_in_front_of_few_points_is_no_view_dependence():
+def test_occlusion_of_few_points_is_no_view_dependence():
     def post(xyz):
-        """In every view a bar hides a twentieth of the points, another one in each."""
+        """In every view a bar hides another twentieth of the points."""
         return np.where(xyz[:, :1] == np.arange(20), -0.2, 0.0)
 
     def highlight(xyz):
@@ -127,7 +127,7 @@ def test_what_is_in_front_of_few_points_is_no_view_dependence():
     assert looked_at(post).view_dependence < 0.004 < looked_at(highlight).view_dependence
 
 
-def test_what_shines_on_dark_points_is_no_exposure():
+def test_highlights_on_dark_points_are_no_exposure():
     found = looked_at(lambda xyz: np.zeros((400, 20)))
     rng = np.random.default_rng(1)
     shine = (rng.random((400, 20)) < 0.15) * (0.05 + 0.1 * rng.random((400, 20)) * np.linspace(0, 1, 20))
@@ -137,13 +137,13 @@ def test_what_shines_on_dark_points_is_no_exposure():
     assert replace(found, color=color * gains).gain_spread == pytest.approx(np.log(gains).std(), rel=0.1)
 
 
-def test_exposure_is_as_large_as_it_was_made(scenes):
+def test_measured_exposure_agrees_with_the_synthetic_gains(scenes):
     gains = np.array(json.loads((scenes("exposure") / "synth.json").read_text())["gains"])
     value = decisions(scenes("exposure"))["exposure"].value / 100
     assert value == pytest.approx(np.log(gains).std(0).max(), rel=0.15)
 
 
-def test_points_that_say_nothing_leave_the_usual_setting(scenes):
+def test_defaults_are_kept_without_surface_points(scenes):
     loaded = load_scene(scenes("plain"))
     from linprim_geo.points.initial_points import VolumePoints
 
@@ -166,7 +166,7 @@ def test_depth_in_another_unit_is_not_used(scenes):
     assert decisions(replace(loaded, train=half))["depth"].value == 50
 
 
-def test_what_is_asked_comes_before_the_data_and_what_is_given_before_all(scenes):
+def test_precedence_of_options_requests_and_data(scenes):
     options = replace(OPTIONS, sh_degree=3, order="overlap")
     choice = Choice("auto", {"view-dependence": False, "filter": True}, frozenset({"sh_degree", "order"}))
     found = decisions(scenes("plain"), choice, options)
@@ -184,19 +184,19 @@ def test_what_is_asked_comes_before_the_data_and_what_is_given_before_all(scenes
     assert set(decisions(scenes("plain"), Choice("none", {"double": True}))) == {"double"}
 
 
-def test_a_gaussian_has_no_overlap(scenes):
+def test_overlap_is_impossible_for_gaussians(scenes):
     found = decisions(scenes("plain"), Choice("all"), replace(OPTIONS, primitive="gaussian"))
     assert (found["overlap"].on, found["overlap"].reason) == (False, "impossible")
 
 
-def test_evidence_is_taken_of_as_many_primitives_as_training_begins_with(scenes):
-    """At points of the scene, none of them twice."""
+def test_evidence_uses_the_start_positions_of_training(scenes):
+    """Start positions are distinct points of the scene."""
     xyz, spacing = Data(load_scene(scenes("plain")), replace(OPTIONS, max_primitives=1000)).start
     assert len(np.unique(xyz, axis=0)) == len(spacing) == SFM_START * 1000
 
 
-def test_the_affine_bound_bounds(scenes):
-    """A point that far from a centre is off by no more than the formula says, but for third order."""
+def test_the_bound_of_affine_errors_holds(scenes):
+    """Errors of the affine projection are below the formula up to third-order terms."""
     rng = np.random.default_rng(0)
     data = Data(load_scene(scenes("plain")), OPTIONS)
     xyz, spacing = data.start
@@ -213,7 +213,7 @@ def test_the_affine_bound_bounds(scenes):
     assert ratio.max() < 1.1 and np.median(ratio) > 0.3
 
 
-def test_a_lens_that_is_nearly_a_pinhole_is_taken_for_one(scenes):
+def test_slight_distortion_is_ignored(scenes):
     slight = load_scene(scenes("slight"))
     assert all(view.lens is not None for view in slight.views)
     found = decisions(slight)["lens"]
@@ -225,7 +225,7 @@ def test_a_lens_that_is_nearly_a_pinhole_is_taken_for_one(scenes):
     assert all(view.lens is not None for view in load_scene(scenes("lens"), pinhole_below=0.1).views)
 
 
-def test_the_shift_of_a_lens_is_that_of_its_corner():
+def test_largest_displacement_is_at_the_corner():
     lens = Lens("OPENCV", 200, 100, (100.0, 100.0, 100.0, 50.0, 0.1, 0.0, 0.0, 0.0))
     radius = np.hypot(1.0, 0.5)
     assert largest_displacement(lens) == pytest.approx(100 * 0.1 * radius**3)
@@ -234,7 +234,7 @@ def test_the_shift_of_a_lens_is_that_of_its_corner():
     assert straightened(lens, 13.9) is lens
 
 
-def test_the_lens_of_synth_is_opencvs(scenes):
+def test_synthetic_distortion_agrees_with_opencv(scenes):
     """Undistorted by the reader, photographs and depth of the lens agree with those of the pinhole."""
     bent, plain = load_scene(scenes("lens")).train[3], load_scene(scenes("plain")).train[3]
     depth, truth = bent.load_depth(), plain.load_depth()
@@ -248,7 +248,7 @@ def test_the_lens_of_synth_is_opencvs(scenes):
     assert "k1" in (scenes("lens") / "transforms_train.json").read_text()
 
 
-def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points):
+def test_decisions_are_recorded_and_kept_on_resume(scenes, tmp_path, own_points):
     options = replace(OPTIONS, iterations=12, evaluate_every=0, checkpoint_every=6, max_primitives=100)
     given = frozenset({"iterations", "max_primitives"})
     train(
@@ -266,7 +266,7 @@ def test_training_decides_records_and_resumes_by_it(scenes, tmp_path, own_points
     again = train(scenes("exposure"), tmp_path / "run", resume=True, quiet=True, effects=Choice("all"))
     assert again["iterations"] == 12 and Run.open(tmp_path / "run").train_options == chosen
     train(scenes("exposure"), tmp_path / "python", options=options, quiet=True)
-    # With masks nothing is held to stereo.
+    # Stereo depths are not used with masks.
     assert Run.open(tmp_path / "python").train_options == replace(options, stereo_depth=0.0, dropout=0.0)
     assert json.loads((tmp_path / "python" / "config.json").read_text())["effects"] == []
 
@@ -313,7 +313,7 @@ def test_inspect_prints_and_gives_json(scenes, capsys):
         ("=on", "no effect ''"),
     ],
 )
-def test_an_effect_that_makes_no_sense_is_refused(word, sentence, capsys, tmp_path):
+def test_invalid_effects_are_refused(word, sentence, capsys, tmp_path):
     with pytest.raises(LinprimError, match="--effect"):
         parse_asked([word])
     assert cli.main(["train", str(tmp_path), "--effect", word]) == 1
@@ -321,7 +321,7 @@ def test_an_effect_that_makes_no_sense_is_refused(word, sentence, capsys, tmp_pa
     assert sentence in error and error.count("\n") == 1
 
 
-def test_effects_are_asked_for_by_name():
+def test_effects_are_parsed_by_name():
     assert parse_asked(["exposure=on", "lens=off"]) == {"exposure": True, "lens": False} and parse_asked([]) == {}
 
 
@@ -335,8 +335,8 @@ def test_every_effect_names_options_that_exist():
         Choice("auto", {"glare": True})
 
 
-def test_synth_without_effects_is_as_before(scenes, tmp_path):
-    """The switches, left alone, change no file."""
+def test_default_effect_options_of_synth_change_no_file(scenes, tmp_path):
+    """Neutral values of the options give the same files."""
     synthesize(tmp_path / "again", **SMALL, exposure_drift=0.0, distortion=0.0, specular=0.0, zoom=1.0)
     for name in (
         "train/003.png",

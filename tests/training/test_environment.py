@@ -1,4 +1,4 @@
-"""The environment at infinity: its operator, what photographs say of it, and a training before one."""
+"""The environment at infinity: its operator, its texels, and a training with it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from linprim_geo.training.train import train
 
 
 def camera_of(seed: int, width: int = 13, height: int = 9, focal: float = 7.0) -> Camera:
-    """A camera somewhere, turned at random."""
+    """A camera with random pose."""
     rng = np.random.default_rng(seed)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     rotation *= np.sign(np.linalg.det(rotation))
@@ -53,7 +53,7 @@ def random_inputs(seed: int, camera: Camera, size: int, dtype=torch.float64):
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 16])
-def test_it_agrees_with_the_reference(size):
+def test_environment_light_agrees_with_the_reference(size):
     for seed in range(12):  # all faces, edges and corners are seen by some
         camera = camera_of(seed)
         opacity, texels = random_inputs(seed, camera, size)
@@ -70,14 +70,14 @@ def test_the_gradients_agree_with_finite_differences():
     assert torch.autograd.gradcheck(lambda *t: ops.environment_light(*t, camera), (opacity, texels))
 
 
-def test_it_is_a_torch_operator():
+def test_environment_light_passes_opcheck():
     camera = camera_of(1)
     opacity, texels = (t.requires_grad_() for t in random_inputs(1, camera, 4))
     arguments = (opacity, texels, camera.rotation.reshape(-1).tolist(), [7.0, 7.0, 6.0, 4.0], 0.0)
     torch.library.opcheck(torch.ops.linprim_geo.environment_light.default, arguments)
 
 
-def test_the_place_of_a_camera_does_not_matter_and_threads_neither():
+def test_light_does_not_depend_on_camera_position_or_threads():
     camera = camera_of(5, 64, 48, 20.0)
     opacity, texels = random_inputs(5, camera, 8, torch.float32)
     moved = camera.world_to_camera.copy()
@@ -95,8 +95,8 @@ def test_the_place_of_a_camera_does_not_matter_and_threads_neither():
     assert all(torch.equal(a, b) for a, b in zip(*grads, strict=True))
 
 
-def test_a_linear_colour_is_continuous_over_edges_and_corners():
-    """Texels that hold a linear function of the unit direction are it to the order of the texels' size, everywhere."""
+def test_interpolation_is_continuous_over_edges_and_corners():
+    """Texels with a linear function of the unit direction reproduce it up to the size of a texel."""
     size = 64
     directions = texel_directions(size)
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -113,19 +113,19 @@ def test_a_linear_colour_is_continuous_over_edges_and_corners():
         assert np.abs(found - wanted).max() < 0.4 * 2 / size
 
 
-def test_an_ended_ray_sees_no_light():
+def test_opaque_rays_receive_no_light():
     camera = camera_of(2)
     opacity, texels = random_inputs(2, camera, 4)
     nearly = torch.full_like(opacity, 1 - 0.9e-3)
     assert not ops.environment_light(nearly, texels, camera, 1e-3).any()
 
 
-def test_every_texel_is_the_nearest_to_its_own_direction():
+def test_nearest_texel_inverts_texel_directions():
     for size in (1, 3, 8):
         assert np.array_equal(nearest_texel(texel_directions(size), size).ravel(), np.arange(6 * size * size))
 
 
-def test_filled_texels_keep_what_is_known_and_lie_within_it():
+def test_filling_keeps_known_texels_and_their_range():
     torch.manual_seed(0)
     texels, weight = torch.rand(6, 12, 12, 3), (torch.rand(6, 12, 12, 1) > 0.8).float()
     weight[4] = 0
@@ -137,7 +137,7 @@ def test_filled_texels_keep_what_is_known_and_lie_within_it():
     assert torch.equal(filled(texels, torch.zeros(6, 12, 12, 1)), torch.full_like(texels, 0.5))
 
 
-def test_texels_are_seen_where_most_light_passes():
+def test_seen_through_marks_texels_that_receive_light():
     size, camera = 8, camera_of(4, 60, 60, 30.0)
     opacity = torch.zeros(60, 60)
     everything = seen_through(size, [(camera, opacity)])
@@ -153,7 +153,7 @@ def test_texels_are_seen_where_most_light_passes():
     assert not (half & ~everything).any()
 
 
-def test_light_that_contradicts_a_photograph_is_not_to_pass():
+def test_contradiction_penalises_light_of_wrong_colour():
     photo, left = torch.full((3, 4, 5), 0.5), torch.full((4, 5), 0.25, requires_grad=True)
     agrees, differs = (contradiction(photo, left.detach() * color, left) for color in (0.505, 0.7))
     assert float(agrees.detach()) == 0
@@ -162,7 +162,7 @@ def test_light_that_contradicts_a_photograph_is_not_to_pass():
     assert torch.allclose(grad, torch.tensor((0.2 - SAME_COLOR / 255) / 20))
 
 
-def test_files_come_back_and_damaged_ones_are_refused(tmp_path):
+def test_environments_survive_a_round_trip_and_damage_is_refused(tmp_path):
     torch.manual_seed(1)
     texels = torch.rand(6, 5, 5, 3)
     assert load_environment(tmp_path) is None
@@ -182,7 +182,7 @@ def test_files_come_back_and_damaged_ones_are_refused(tmp_path):
 
 
 def test_a_panorama_shows_the_axes():
-    """+x in the middle, +y a quarter to the left, +z on top: texels that hold the unit direction."""
+    """Texels contain the unit direction: +x is in the centre, +y a quarter to the left, +z at the top."""
     directions = texel_directions(16)
     unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     picture = panorama(torch.from_numpy(((unit + 1) / 2).astype(np.float32))) / 127.5 - 1
@@ -194,7 +194,7 @@ def test_a_panorama_shows_the_axes():
 
 @pytest.fixture(scope="module")
 def tabletop(tmp_path_factory):
-    """An object on a table before a far room, photographed with noise."""
+    """A noisy capture of an object on a table in front of a far room."""
     folder = tmp_path_factory.mktemp("tabletop")
     synthesize(
         folder / "scene",
@@ -215,9 +215,9 @@ def tabletop(tmp_path_factory):
 OPTIONS = TrainOptions(iterations=600, max_primitives=3000, sh_degree=1, evaluate_every=0)
 
 
-def test_an_object_on_a_table_before_a_far_room(tabletop):
-    """Seeds 0 to 9 (AVX-512): 27.5 to 27.9 dB held out, 1.6 to 1.9 dB behind training views, no vertex farther off than
-    4.2 % of the diagonal; over a random background 20.0 dB, and half of the vertices are 5 % off, the farthest 31 %."""
+def test_training_an_object_in_front_of_a_far_room(tabletop):
+    """Measured with seeds 0 to 9 (AVX-512): 27.5 to 27.9 dB held out, 1.6 to 1.9 dB less than training views, vertices
+    off by at most 4.2 % of the diagonal. With random background: 20.0 dB, median 5 %, largest 31 %."""
     decided = inspect_scene(tabletop / "scene", options=OPTIONS)["options"]
     assert decided["background"] == "environment"
     run = tabletop / "run"
@@ -228,7 +228,7 @@ def test_an_object_on_a_table_before_a_far_room(tabletop):
     distance = np.sqrt(igl.point_mesh_squared_distance(mesh.vertices, truth.vertices, truth.faces)[0])
     assert distance.max() < 0.1 * np.linalg.norm(np.ptp(truth.vertices, axis=0))
     assert stats["seen_by_one_view"].keys() == {"pieces", "area"}
-    # What stands behind everything is the room of `synthetic_environment`, where any camera saw past the scene.
+    # Where cameras see past the scene, the render shows the room of `synthetic_environment`.
     opened = Run.open(run)
     view = opened.scene().test[0]
     (_, images), rays = next(opened.render_views([view])), view.camera.world_rays()
@@ -237,7 +237,7 @@ def test_an_object_on_a_table_before_a_far_room(tabletop):
     assert behind.sum() > 1000 and np.median(np.abs(images["rgb"].transpose(1, 2, 0) - room)[behind]) < 0.02
 
 
-def test_a_training_before_an_environment_resumes_to_the_same_bits(tabletop):
+def test_resuming_with_an_environment_repeats_the_run_bit_for_bit(tabletop):
     options = replace(OPTIONS, iterations=120, checkpoint_every=60, background="environment")
     whole, parts = tabletop / "whole", tabletop / "parts"
     train(tabletop / "scene", whole, options=options, quiet=True)
@@ -248,7 +248,7 @@ def test_a_training_before_an_environment_resumes_to_the_same_bits(tabletop):
     assert (whole / "scene.npz").read_bytes() == (parts / "scene.npz").read_bytes()
 
 
-def test_closed_scenes_masks_and_plain_backdrops_have_none(tiny_run, tabletop, tmp_path):
+def test_closed_scenes_and_masked_captures_have_no_environment(tiny_run, tabletop, tmp_path):
     tiny_run = Run.open(tiny_run)
     assert tiny_run.environment is None  # alpha says what is background
     with pytest.raises(LinprimError, match="--background environment: masks or alpha"):

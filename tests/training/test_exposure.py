@@ -1,5 +1,4 @@
-"""Exposure: gains of photographs are found, keep their gauge, survive a kill bit for bit, and are told to whoever
-scores."""
+"""Exposure: gains of photographs are found, keep their mean, are resumed bit for bit, and are used in scores."""
 
 from __future__ import annotations
 
@@ -41,7 +40,7 @@ def drifting(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def own_points(monkeypatch):
-    """Trainings start from the scene's points alone: looking for more is slow, and no matter of exposure."""
+    """Use only the scene's points as start points; finding more is slow and irrelevant here."""
     monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
@@ -49,8 +48,8 @@ def true_gains(scene):
     return np.array(json.loads((scene / "synth.json").read_text())["gains"])
 
 
-def test_photographs_show_their_gains(drifting):
-    """The gains are in the pixels: of a plain background each photograph shows gain times its colour."""
+def test_synthetic_photographs_contain_their_gains(drifting):
+    """Each photograph shows its gain times the colour of the uniform background."""
     gains = true_gains(drifting)
     assert np.abs(np.log(gains).mean(0)).max() < 1e-12 and np.log(gains).std() > 0.1
     for index in (0, 7):
@@ -59,7 +58,7 @@ def test_photographs_show_their_gains(drifting):
     assert np.abs(load_scene(drifting).test[0].load().rgb[0, 0] / 255 - 0.4).max() < 0.003
 
 
-def test_points_tell_the_gains_before_training(drifting):
+def test_gains_are_estimated_from_points(drifting):
     found, error = observe(load_scene(drifting)).log_gains
     assert np.abs(np.exp(found) / true_gains(drifting) - 1).max() < 0.06
     assert np.abs(found.mean(0)).max() < 1e-9 and np.isfinite(error).all()
@@ -105,7 +104,7 @@ def test_a_resumed_run_repeats_the_gains_bit_for_bit(drifting, tmp_path, monkeyp
             assert one[table][name].numpy().tobytes() == other[table][name].numpy().tobytes(), name
 
 
-def test_only_the_photograph_of_a_step_moves_before_the_gauge():
+def test_an_update_moves_one_gain_and_keeps_the_mean():
     exposure = Exposure(4, np.log([[1.0] * 3, [2.0] * 3, [0.5] * 3, [1.0] * 3]))
     before = exposure.log_gain.clone()
     assert torch.equal(before.mean(0), torch.zeros(3))
@@ -117,7 +116,7 @@ def test_only_the_photograph_of_a_step_moves_before_the_gauge():
     assert exposure.steps.tolist() == [0, 0, 1, 0]
 
 
-def test_the_background_behind_masks_has_no_gain_and_white_is_white():
+def test_background_has_no_gain_and_clipped_white_stays():
     rgb, behind = torch.full((3, 2, 2), 0.6), torch.full((3, 2, 2), 0.2)
     target = torch.full((3, 2, 2), 0.5)
     target[:, 0, 0] = 1.0
@@ -130,7 +129,7 @@ def test_the_background_behind_masks_has_no_gain_and_white_is_white():
     assert torch.autograd.gradcheck(exposed, arguments)
 
 
-def test_the_best_gain_is_least_squares():
+def test_best_gain_is_the_least_squares_solution():
     rng = np.random.default_rng(0)
     render = rng.uniform(0.2, 0.8, (6, 5, 3))
     photo = render * [0.8, 1.1, 1.3]

@@ -1,5 +1,4 @@
-"""Terms of the training loss beside the photographs: closed forms, gradients that point the right way, and runs that
-use them."""
+"""Geometric terms of the training loss: closed forms, gradients, and runs that use them."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ from linprim_geo.training.step import geometry_terms as terms
 
 
 def camera() -> Camera:
-    """Looks along +z from the origin."""
+    """A camera at the origin that looks along +z."""
     return Camera(64, 56, 70.0, 72.0, 33.0, 27.0, np.eye(4))
 
 
@@ -44,12 +43,12 @@ def constant_normals(normal, like: torch.Tensor) -> torch.Tensor:
     return torch.as_tensor(normal, dtype=like.dtype)[:, None, None].expand(3, *like.shape)
 
 
-def test_the_normals_of_a_plane_are_its_own():
+def test_depth_normals_of_a_plane_are_exact():
     depth = plane_depth(camera(), NORMAL, OFFSET)
     found, valid = terms.depth_normals(depth, camera())
     assert valid[1:-1, 1:-1].all() and valid.sum() == (depth.shape[0] - 2) * (depth.shape[1] - 2)
     assert (found[:, valid] - torch.from_numpy(NORMAL)[:, None]).abs().max() < 1e-12
-    depth[20, 30] = 0  # a pixel without depth takes itself and its four neighbours away
+    depth[20, 30] = 0  # a pixel without depth invalidates itself and its four neighbours
     assert int(valid.sum() - terms.depth_normals(depth, camera())[1].sum()) == 5
     assert not terms.depth_normals(torch.zeros(5, 5), replace(camera(), width=5, height=5))[0].any()
 
@@ -68,7 +67,7 @@ def test_normal_consistency_is_one_minus_the_cosine():
     assert float(terms.normal_consistency(rendering(empty, constant_normals(tilted, depth), 0.0), camera())) == 0
 
 
-def test_normal_consistency_has_the_gradient_of_its_differences():
+def test_gradient_of_normal_consistency_agrees_with_finite_differences():
     small = replace(camera(), width=6, height=5)
     depth = plane_depth(small, NORMAL, OFFSET) + 0.05 * torch.rand(
         5, 6, dtype=torch.float64, generator=torch.manual_seed(0)
@@ -99,8 +98,8 @@ def test_depth_error_is_relative_capped_and_weighted():
 
 
 @pytest.mark.parametrize(("column", "row"), [(0, 0), (2, 1)])
-def test_plane_error_is_what_exceeds_the_accuracy_of_stereo(column, row):
-    """Of a tilted plane in an image that is three times as small, at one of the nine pixels of each of its pixels."""
+def test_plane_error_counts_beyond_the_margin_of_stereo(column, row):
+    """A tilted plane in an image averaged down by 3, compared at one of the nine pixels of each pixel."""
     full, small = camera(), smaller(camera(), 3)
     depth = plane_depth(full, NORMAL, OFFSET)
     inverse = 1 / plane_depth(small, NORMAL, OFFSET)
@@ -132,7 +131,7 @@ def test_normal_error_counts_pixels_that_have_a_normal():
     assert float(terms.normal_error(found, 0 * wanted, depth)) == 0
 
 
-def test_terms_add_up_by_their_weights_where_there_is_evidence_for_them():
+def test_loss_is_the_weighted_sum_of_terms_with_evidence():
     depth = plane_depth(camera(), NORMAL, OFFSET)
     normal, seen = constant_normals(NORMAL, depth), torch.tensor([[3, 10], [20, 40]])
     whole = terms.Evidence(
@@ -153,7 +152,7 @@ def test_terms_add_up_by_their_weights_where_there_is_evidence_for_them():
         assert float(found.loss(weights, out, view, 0, torch.zeros(4))) == pytest.approx(wanted, rel=1e-6)
 
 
-def test_a_surface_of_stereo_is_evidence_as_soon_as_a_part_of_it_is_known():
+def test_stereo_maps_with_known_pixels_are_evidence():
     nowhere, somewhere = np.zeros((2, 3, 2, 2), np.float32)
     somewhere[:, 1, 0] = [0.5, 0.1, -0.2]
     surfaces = [
@@ -167,7 +166,7 @@ def test_a_surface_of_stereo_is_evidence_as_soon_as_a_part_of_it_is_known():
     assert torch.equal(found[1].planes, torch.from_numpy(somewhere / 4)) and found[1].factor == 2
 
 
-def test_surfaces_of_stereo_have_their_weight_in_the_mean_over_steps():
+def test_the_mean_weight_of_stereo_depth_over_steps_is_the_option():
     evidence = [terms.Evidence(planes=torch.ones(3, 2, 2)), terms.Evidence()]
     found = terms.GeometryTerms(TrainOptions(stereo_depth=0.3), [None, None], evidence)
     weights = [[found.weights(view, step, False).get("stereo_depth", 0.0) for step in range(10)] for view in (0, 1)]
@@ -192,7 +191,7 @@ def plain(tiny_scene, options, tmp_path_factory):
     return trained(tiny_scene, tmp_path_factory.mktemp("plain") / "run", options)
 
 
-def test_without_weights_the_renderer_is_not_asked_for_geometry(tiny_scene, options, tmp_path, monkeypatch):
+def test_geometry_is_rendered_only_if_a_term_needs_it(tiny_scene, options, tmp_path, monkeypatch):
     asked = []
     rasterize = ops.rasterize
     monkeypatch.setattr(ops, "rasterize", lambda *a, **k: asked.append(k.get("geometry", False)) or rasterize(*a, **k))
@@ -215,7 +214,7 @@ def test_every_term_changes_the_run(name, tiny_scene, options, plain, tmp_path):
     assert all(np.isfinite(getattr(found, key)).all() for key in ("center", "extent", "density"))
 
 
-def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_path):
+def test_resuming_with_all_terms_repeats_the_run_bit_for_bit(tiny_scene, options, tmp_path):
     from linprim_geo.training.train import train
 
     every = replace(options, order="overlap", order_from=0.6, **dict.fromkeys(GEOMETRY_WEIGHTS, 0.05))
@@ -234,18 +233,18 @@ def test_a_run_with_every_term_resumes_to_the_last_bit(tiny_scene, options, tmp_
     )
 
 
-def test_sensor_depth_brings_the_surface_to_it(tiny_scene, options, tmp_path):
+def test_sensor_depth_reduces_the_depth_error(tiny_scene, options, tmp_path):
     from linprim_geo.eval.depth import eval_depth_run
 
     longer = replace(options, iterations=300, geometry_from=0.1)
     trained(tiny_scene, tmp_path / "plain", longer)
     trained(tiny_scene, tmp_path / "depth", replace(longer, sensor_depth=2.0))
     errors = {name: eval_depth_run(tmp_path / name)["abs_rel"] for name in ("plain", "depth")}
-    # By how much depends on the seed: 0.65 to 0.80 of it in three trainings.
+    # The ratio depends on the seed: 0.65 to 0.80 in three trainings.
     assert errors["depth"] < errors["plain"], errors
 
 
-def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
+def test_normals_of_the_data_set_agree_with_the_reference_mesh(tiny_scene):
     from linprim_geo.capture.load import load_scene
     from linprim_geo.geometry.mesh_files import load_mesh
     from linprim_geo.geometry.raycast import RayCaster
@@ -266,7 +265,7 @@ def test_normals_of_the_data_set_are_those_of_its_surface(tiny_scene):
         assert (found[hit][:, 2] < 0.1).all()  # towards the camera
 
 
-def test_a_term_without_evidence_says_so(tmp_path):
+def test_terms_without_evidence_are_reported(tmp_path):
     from linprim_geo.capture.load import load_scene
 
     run = octahedron_run(tmp_path, views=4, size=24)

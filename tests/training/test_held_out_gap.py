@@ -1,4 +1,4 @@
-"""When a training says that it does not hold between its photographs, and which cause it names."""
+"""Advice for trainings whose held-out views score much lower than training views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DRIFT = {"name": "exposure", "value": 9.0, "threshold": 3.0}
 NEITHER = {"name": "environment", "value": None, "threshold": 10.0}
 
 
-def test_nothing_is_said_up_to_the_limit():
+def test_no_advice_up_to_the_limit():
     assert gap_advice(30.0, 30.0 - LARGEST_GAP, 50, TrainOptions(), [FAR]) is None
     assert gap_advice(20.0, 30.0, 5, TrainOptions(), []) is None
     assert gap_advice(float("nan"), 10.0, 50, TrainOptions(), []) is None
@@ -28,6 +28,6 @@ def test_nothing_is_said_up_to_the_limit():
         ([NEITHER, {}], TrainOptions(), FEW_VIEWS, "poses that are off"),
     ],
 )
-def test_the_cause_that_has_evidence_is_named(decisions, options, views, named):
+def test_advice_names_the_cause_with_evidence(decisions, options, views, named):
     advice = gap_advice(29.0, 15.3, views, options, decisions)
     assert advice.startswith("held-out views are 13.7 dB behind training views: ") and named in advice

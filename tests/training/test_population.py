@@ -1,4 +1,4 @@
-"""Growth of the population: who is cut, what the halves are, when it happens, and that the cap holds."""
+"""Growth of the population: choice of parents, halves of primitives, schedule, and limit."""
 
 from __future__ import annotations
 
@@ -59,13 +59,13 @@ def test_the_plan_reaches_the_cap_before_growth_ends(iterations, start, cap):
         if count == cap and reached is None:
             reached = step
     assert reached is not None and reached <= 0.6 * iterations
-    # Not all at once either: the second half of the growth phase still adds.
+    # Growth is spread over the phase: its second half still adds primitives.
     assert reached >= 0.3 * iterations
     assert steps[0] >= 0.03 * iterations and steps[-1] <= 0.6 * iterations
 
 
 @pytest.mark.parametrize(("iterations", "every"), [(30_000, 100), (6000, 100), (3000, 50), (300, 10)])
-def test_events_are_a_hundred_steps_apart_and_closer_in_shorter_runs(iterations, every):
+def test_events_are_100_steps_apart_and_closer_in_short_runs(iterations, every):
     growth = Growth.plan(iterations, 100, 1000)
     due = [step for step in range(1, iterations + 1) if growth.is_due(step)]
     assert set(np.diff(due)) == {every}
@@ -80,7 +80,7 @@ def test_a_plan_exists_for_every_run(iterations, start, cap):
     assert not growth.is_due(0)
 
 
-def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut():
+def test_halves_stay_inside_the_parent_along_the_cut_axis():
     table = parameters(200)
     screen_gradient = torch.ones(200)
     parents, children, halves = event(table, screen_gradient, rate=0.25)
@@ -110,7 +110,7 @@ def test_halves_stay_inside_the_box_of_the_parent_and_along_the_axis_that_is_cut
     assert (shifts[0][0] == shifts[1][0]).all() and np.allclose(shifts[0][1], -shifts[1][1])
 
 
-def test_long_axes_are_cut_in_proportion_to_their_square():
+def test_axes_are_cut_with_probability_proportional_to_their_square():
     table = parameters(4000)
     table["log_extent"] = torch.log(torch.tensor([0.1, 0.2, 0.3])).repeat(4000, 1)
     parents, _, halves = event(table, torch.ones(4000), rate=1.0)
@@ -121,7 +121,7 @@ def test_long_axes_are_cut_in_proportion_to_their_square():
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6])
-def test_parents_are_drawn_in_proportion_to_the_pull(unit):
+def test_parents_are_drawn_in_proportion_to_the_screen_gradient(unit):
     table = parameters(400)
     screen_gradient = torch.zeros(400)
     screen_gradient[100:300] = unit
@@ -136,7 +136,7 @@ def test_parents_are_drawn_in_proportion_to_the_pull(unit):
     assert abs(counts[200:300].sum() / 1200 - 0.75) < 0.0375
 
 
-def test_dead_primitives_become_halves_of_others_and_are_never_parents():
+def test_dead_primitives_are_replaced_and_are_no_parents():
     table = parameters(100)
     table["raw_opacity"][10:15] = math.log(DEAD_OPACITY / (1 - DEAD_OPACITY)) - 0.1
     table["log_extent"][20:23, 1] = SMALLEST
@@ -144,7 +144,7 @@ def test_dead_primitives_become_halves_of_others_and_are_never_parents():
     dead = [*range(10, 15), 20, 21, 22]
     assert list(children) == dead and len(parents) == 8
     assert not set(parents) & set(dead)
-    # Just above the threshold lives on.
+    # An opacity just above the threshold is kept.
     table["raw_opacity"][10:15] = math.log(DEAD_OPACITY / (1 - DEAD_OPACITY)) + 0.1
     assert list(event(table, torch.ones(100), cap=100)[1]) == [20, 21, 22]
 
@@ -161,7 +161,7 @@ def test_the_cap_holds_at_every_event():
     assert len(event(parameters(120), torch.ones(120), cap=cap)[0]) == 0
 
 
-def test_draws_depend_on_the_generator_alone():
+def test_draws_depend_only_on_the_generator():
     table, screen_gradient = parameters(300), torch.rand(300, generator=torch.Generator().manual_seed(1))
     before = {name: value.clone() for name, value in table.items()}
     first, again, other = (event(table, screen_gradient, rate=0.1, seed=seed) for seed in (7, 7, 8))
@@ -177,23 +177,23 @@ def test_a_population_of_one_can_be_cut():
     assert len(event(parameters(1), torch.ones(1), cap=1)[0]) == 0
 
 
-def test_nothing_is_cut_where_nothing_pulls():
+def test_nothing_is_cut_without_screen_gradient():
     parents, children, halves = event(parameters(50), torch.zeros(50))
     assert len(parents) == len(children) == 0
     assert halves["center"].shape == halves["log_extent"].shape == (2, 0, 3)
-    # No more parents than are pulled at, however large the rate.
+    # Parents need a screen gradient at any rate.
     screen_gradient = torch.zeros(50)
     screen_gradient[3] = 1
     assert list(event(parameters(50), screen_gradient, rate=1.0)[0]) == [3]
 
 
-def test_all_dead_leaves_all_as_they_are():
+def test_a_population_of_dead_primitives_is_unchanged():
     table = parameters(20)
     table["raw_opacity"][:] = -20
     assert len(event(table, torch.ones(20))[0]) == 0
 
 
-def test_halves_of_a_population_together_hold_most_of_its_volume():
+def test_halves_of_an_octahedron_have_77_percent_of_its_volume():
     # Each half has 0.6 * 0.8^2 = 0.384 of the parent's volume, at unchanged opacity.
     along, across = Octahedron.ALONG, Octahedron.ACROSS
     table = parameters(10)
@@ -234,7 +234,7 @@ def test_halves_of_a_tetrahedron_stay_inside_it_and_share_its_longest_edge():
     assert (kept[0] != kept[1]).all()
 
 
-def test_halves_of_a_tetrahedron_hold_most_of_its_volume_and_overlap_little():
+def test_halves_of_a_tetrahedron_cover_most_of_its_volume_and_overlap_little():
     table = parameters(200, kind="tetrahedron")
     parents, _, halves = event(table, torch.ones(200), rate=0.5, kind="tetrahedron")
     whole = shapes(table, "tetrahedron", parents)
@@ -251,7 +251,7 @@ def test_halves_of_a_tetrahedron_hold_most_of_its_volume_and_overlap_little():
     assert (inside == 0).mean() < 0.3 and (inside == 2).mean() < 0.15
 
 
-def test_halves_of_a_gaussian_keep_its_moments_and_its_thickness():
+def test_halves_of_a_gaussian_keep_its_moments_and_optical_thickness():
     table = parameters(100, kind="gaussian")
     parents, _, halves = event(table, torch.ones(100), rate=0.5, kind="gaussian")
     rotation = shapes(table, "octahedron", parents).axes
@@ -271,7 +271,7 @@ def test_halves_of_a_gaussian_keep_its_moments_and_its_thickness():
     np.testing.assert_allclose((both * size).sum(0), thickness, rtol=1e-5)
 
 
-def test_views_of_different_resolution_count_alike():
+def test_screen_gradients_do_not_depend_on_resolution():
     control = GradientControl(TrainOptions(iterations=100, max_primitives=60), 1, [], (1e-3, 1.0))
     for size, pull in (((100, 50), 0.02), ((25, 50), 0.04)):  # per pixel: of twice as large ones it is twice as much
         control.accumulate({}, None, size, torch.tensor([[9.0, 9.0, pull]]))

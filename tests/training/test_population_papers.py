@@ -1,5 +1,4 @@
-"""The papers' rules of growth: who is cloned, cut, pruned, reset, moved; what is kept by it; and that everything
-repeats."""
+"""Density control of the papers: cloning, splitting, pruning, resets and relocation, and reproducibility."""
 
 from __future__ import annotations
 
@@ -55,7 +54,7 @@ def opacity_of(raw) -> np.ndarray:
 
 
 def after(event, parameters, name):
-    """The new table of one parameter."""
+    """The values of one parameter after an event."""
     new = parameters[name].numpy()[event.source].astype(np.float64)
     if name in event.values:
         rows, values = event.values[name]
@@ -76,13 +75,13 @@ def mcmc(count, kind="octahedron", **options):
 # --- 3DGS -------------------------------------------------------------------------------------------------
 
 
-def test_the_radius_is_that_of_the_cameras():
+def test_the_scene_radius_agrees_with_3dgs():
     assert scene_radius(CAMERAS) == pytest.approx(RADIUS)
     assert scene_radius(CAMERAS[:1]) == 2.6
 
 
 @pytest.mark.parametrize(("kind", "every"), [("octahedron", 250), ("tetrahedron", 250), ("gaussian", 100)])
-def test_the_papers_steps(kind, every):
+def test_growth_steps_agree_with_the_papers(kind, every):
     control = classic(5, kind)
     due = [step for step in range(1, 30_001) if control.is_due(step)]
     assert due[0] == (750 if every == 250 else 600) and due[-1] < 15_000
@@ -92,7 +91,7 @@ def test_the_papers_steps(kind, every):
     assert due and due[0] > 50 and due[-1] < 350
 
 
-def test_a_gradient_is_averaged_over_the_views_that_see():
+def test_gradients_accumulate_over_views_that_see_a_primitive():
     control, parameters = classic(3), table(3)
     parameters["center"] = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [9.0, 0, 0]])
     screen = torch.tensor([[3e-6, 4e-6, 9.0], [0, 0, 0], [1, 1, 1]])
@@ -108,13 +107,13 @@ def test_a_gradient_is_averaged_over_the_views_that_see():
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("ray_model", ["exact", "affine"])
-def test_what_reaches_beyond_the_near_plane_is_seen_from_a_centre_behind_the_camera(kind, ray_model):
-    """As far as the kernels draw it: a polyhedron is cut at the near plane, a centre there ends all others."""
+def test_in_view_of_primitives_that_cross_the_near_plane(kind, ray_model):
+    """As in the kernels: solids with exact rays are cut at the near plane, others are dropped by their centre."""
     near, reach = KINDS[kind].near, 0.5
     parameters = table(6, kind)
     parameters["log_extent"][:] = math.log(reach / (1 if KINDS[kind].solid else 3))
-    # Depths of the centre: no part lies beyond the near plane; a part does; nearly all; the centre, too. Two are beside
-    # the image, which ends at slopes of 0.5: the first reaches forward of the near plane and not into it.
+    # Depths of the centre, with no part beyond the near plane, a part, half, and the centre itself. The last two are
+    # beside the image, which ends at slopes of 0.5: the first is not visible, the second is.
     z = torch.tensor([-reach - 1e-3, -reach + 1e-3, -1e-3, 1e-3, -reach / 2, -reach / 2]) + near
     parameters["center"][:] = 0
     parameters["center"][:, 2] = z - 3
@@ -125,7 +124,7 @@ def test_what_reaches_beyond_the_near_plane_is_seen_from_a_centre_behind_the_cam
     assert list(seen) == [False, cut, cut, True, False, cut]
 
 
-def test_small_ones_are_cloned_and_large_ones_split():
+def test_small_primitives_are_cloned_and_large_ones_split():
     control, parameters = classic(4), table(4)
     # Diameters 0.01 and 0.012 around 0.01 * 1.1.
     parameters["log_extent"] = torch.log(torch.tensor([0.005, 0.006, 0.005, 0.006])).repeat(3, 1).T.clone()
@@ -145,7 +144,7 @@ def test_small_ones_are_cloned_and_large_ones_split():
     assert passed[1] == pytest.approx(1 - opacity_of(2.0), rel=1e-5) == passed[4]
 
 
-def test_gaussians_are_copied_as_they_are():
+def test_cloned_gaussians_keep_their_opacity():
     control, parameters = classic(2, "gaussian"), table(2, "gaussian")
     parameters["log_extent"][:] = math.log(0.005)
     control.accumulated = {"gradient": torch.tensor([3e-4, 3e-4]), "seen": torch.ones(2)}
@@ -154,7 +153,7 @@ def test_gaussians_are_copied_as_they_are():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_halves_are_spread_like_the_parent(kind):
+def test_halves_are_drawn_from_the_shape_of_the_parent(kind):
     count, constants = 4000, GAUSSIANS if kind == "gaussian" else POLYHEDRA
     control, parameters = classic(count, kind, max_primitives=2 * count), table(count, kind)
     parameters["center"][:] = 0
@@ -172,7 +171,7 @@ def test_halves_are_spread_like_the_parent(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_faint_and_oversized_ones_are_pruned(kind):
+def test_faint_and_oversized_primitives_are_pruned(kind):
     constants = GAUSSIANS if kind == "gaussian" else POLYHEDRA
     control, parameters = classic(5, kind), table(5, kind)
     parameters["raw_opacity"][:] = 2.0
@@ -186,14 +185,14 @@ def test_faint_and_oversized_ones_are_pruned(kind):
     assert list(control.grow(parameters, 3500).source) == [0, 3, 4]
 
 
-def test_something_is_left():
+def test_pruning_keeps_at_least_one_primitive():
     control, parameters = classic(3), table(3)
     parameters["raw_opacity"] = torch.tensor([-9.0, -8.0, -10.0])
     assert list(control.grow(parameters, 1000).source) == [1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_reset_leaves_nothing_below_the_prune_level(kind):
+def test_opacities_are_reset_above_the_pruning_level(kind):
     constants = GAUSSIANS if kind == "gaussian" else POLYHEDRA
     control, parameters = classic(20, kind), table(20, kind)
     parameters["raw_opacity"][:10] = -3.6
@@ -204,7 +203,7 @@ def test_a_reset_leaves_nothing_below_the_prune_level(kind):
     assert not control.grow(parameters, 3250).reset_opacity
 
 
-def test_the_limit_on_the_population_takes_what_pulls_hardest():
+def test_a_limited_population_grows_by_the_largest_gradients():
     control, parameters = classic(10, max_primitives=12), table(10)
     parameters["raw_opacity"][:] = 1.0
     control.accumulated = {"gradient": torch.arange(10.0), "seen": torch.ones(10)}
@@ -218,7 +217,7 @@ def test_the_limit_on_the_population_takes_what_pulls_hardest():
 # --- MCMC -------------------------------------------------------------------------------------------------
 
 
-def test_relocation_is_the_papers_double_sum():
+def test_relocation_agrees_with_the_double_sum_of_the_paper():
     opacity, copies = (np.array(x) for x in zip(*product((0.006, 0.3, 0.9, 0.999), (1, 2, 3, 7, 20)), strict=True))
     shared, factor = relocated(opacity, copies)
     for row, (o, n) in enumerate(zip(opacity, copies, strict=True)):
@@ -233,7 +232,7 @@ def test_relocation_is_the_papers_double_sum():
     assert relocated(np.array([0.4]), np.array([1]))[1][0] == pytest.approx(1)
 
 
-def test_fifty_copies_lose_no_digits():
+def test_relocation_of_fifty_copies_is_accurate():
     from mpmath import binomial, mp, mpf, sqrt
 
     mp.dps = 60
@@ -245,13 +244,13 @@ def test_fifty_copies_lose_no_digits():
     assert factor[0] == pytest.approx(float(mpf(opacity) / total), rel=1e-6)
 
 
-def test_the_steps_of_relocation():
+def test_relocation_steps_agree_with_the_paper():
     control = mcmc(5)
     due = [step for step in range(1, 30_001) if control.is_due(step)]
     assert due == list(range(600, 25_000, 100))
 
 
-def test_those_that_share_an_opacity_have_the_size_that_relocation_gives_them():
+def test_relocated_primitives_have_the_size_of_the_formula():
     control, parameters = mcmc(50, max_primitives=50), table(50)
     parameters["raw_opacity"][:20] = -6.0
     event = control.grow(parameters, 600)
@@ -264,7 +263,7 @@ def test_those_that_share_an_opacity_have_the_size_that_relocation_gives_them():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_dead_ones_move_onto_living_ones_and_five_percent_join(kind):
+def test_dead_primitives_are_relocated_and_5_percent_are_added(kind):
     control, parameters = mcmc(200, kind), table(200, kind)
     parameters["raw_opacity"][:40] = -6.0
     event = control.grow(parameters, 600)
@@ -295,7 +294,7 @@ def test_parents_are_drawn_in_proportion_to_their_opacity():
     assert np.abs(counts / 2000 - [0.1, 0.3, 0.6]).max() < 0.034
 
 
-def test_a_relocated_one_that_should_vanish_ends_at_the_lower_bound():
+def test_relocated_sizes_respect_the_lower_bound():
     control, parameters = mcmc(40), table(40)
     parameters["log_extent"][:] = math.log(BOUNDS[0])
     parameters["raw_opacity"][:30] = -6.0
@@ -303,7 +302,7 @@ def test_a_relocated_one_that_should_vanish_ends_at_the_lower_bound():
     assert np.exp(event.values["log_extent"][1]).min() >= BOUNDS[0] * (1 - 1e-6)
 
 
-def test_the_population_stays_below_its_limit_and_at_least_one_lives():
+def test_relocation_respects_the_limit_with_dead_populations_too():
     control, parameters = mcmc(100, max_primitives=102), table(100)
     assert len(control.grow(parameters, 600).source) == 102
     parameters["raw_opacity"][:] = -9.0
@@ -311,7 +310,7 @@ def test_the_population_stays_below_its_limit_and_at_least_one_lives():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_noise_moves_transparent_ones_along_their_axes(kind):
+def test_noise_moves_transparent_primitives_along_their_axes(kind):
     count = 4000
     control, parameters = mcmc(count, kind), table(count, kind)
     control.scale = 1.0
@@ -338,7 +337,7 @@ def test_noise_moves_transparent_ones_along_their_axes(kind):
     assert all(torch.equal(before[name], parameters[name]) for name in before if name != "center")
 
 
-def test_the_penalties_are_means_of_size_and_opacity():
+def test_penalties_are_means_of_size_and_opacity():
     parameters = table(10)
     parameters["raw_opacity"].requires_grad_()
     penalty = mcmc(10).penalty(parameters)
@@ -351,7 +350,7 @@ def test_the_penalties_are_means_of_size_and_opacity():
 
 @pytest.mark.parametrize("make", [classic, mcmc])
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_event_depends_on_the_seed_and_the_step_alone(make, kind):
+def test_events_depend_only_on_seed_and_step(make, kind):
     parameters = table(50, kind)
     parameters["raw_opacity"][:5] = -7
     before = {name: value.clone() for name, value in parameters.items()}

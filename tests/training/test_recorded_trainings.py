@@ -1,5 +1,5 @@
-"""Whole trainings come out as they are recorded in recorded_trainings.json. Where a change is meant to make them
-different, record them again (`eval/studies/recorded_trainings.py`) and say by how much."""
+"""Whole trainings agree with recorded_trainings.json. After an intended change record them again
+(`eval/studies/recorded_trainings.py`) and report the difference."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SLOWER = 1.5
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", DRIFT)
-def test_a_training_comes_out_as_recorded(scene, tmp_path):
+def test_a_training_agrees_with_the_record(scene, tmp_path):
     rows = [row for row in RECORDED if row["scene"] == scene]
     found = measure(scene, 0, tmp_path)
     assert all(row["effects"] == found["effects"] for row in rows)

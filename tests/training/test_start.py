@@ -1,4 +1,4 @@
-"""How a run begins and goes on: its folders are found from elsewhere, and what it cannot take is named."""
+"""Start and resumption of runs: folders of options, and options that are ignored."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def option(request) -> str:
 
 @pytest.fixture
 def capture(option, tmp_path) -> Path:
-    """A capture, and beside it the folder `cut` that the option is to name."""
+    """A capture, with the folder `cut` for the option beside it."""
     write_colmap(tmp_path / "capture")
     if option == "sparse":
         write_colmap(tmp_path / "other", points=31)
@@ -44,26 +44,26 @@ def capture(option, tmp_path) -> Path:
 
 
 def found(option: str, scene) -> tuple[set[Path], int]:
-    """The files that come from an option's folder, and the number of points, which says where those come from."""
+    """The files read from an option's folder, and the number of points, which identifies their source."""
     paths = {getattr(view, "mask_path" if option == "masks" else "image_path") for view in scene.train}
     return {path.resolve() for path in paths if path} if option != "sparse" else set(), len(scene.points.xyz)
 
 
 def expected(option: str, folder: Path) -> tuple[set[Path], int]:
-    """As `found`, where `folder` was taken."""
+    """The result of `found` if `folder` is used."""
     # Every 8th of ten photographs is held out.
     names = () if option == "sparse" else (f"{i:02d}.png" for i in range(10) if i % 8)
     return {(folder / name).resolve() for name in names}, 31 if option == "sparse" else 20
 
 
 def begun(capture, run, **options):
-    """A run of such scene options, as a training begins one."""
+    """Begin a run with these scene options."""
     settings, quiet = SceneOptions(poses="given", **options), Progress("", 1, quiet=True)
     new, scene, _ = begin_run(capture, run, settings, TrainOptions(start="points"), Choice("none"), quiet)
     Run.create(run, scene, new.scene_path, new.scene_options, new.train_options, new.similarity)
 
 
-def test_folders_are_found_from_elsewhere_and_no_others_of_their_names(option, capture, tmp_path, monkeypatch):
+def test_option_folders_do_not_depend_on_the_working_directory(option, capture, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     begun(capture, tmp_path / "outside", **{option: "cut"})
     shutil.copytree(tmp_path / "cut", capture / "inside")
@@ -72,13 +72,13 @@ def test_folders_are_found_from_elsewhere_and_no_others_of_their_names(option, c
         (tmp_path / "elsewhere" / name).mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert found(option, Run.open(tmp_path / "outside").scene()) == expected(option, tmp_path / "cut")
-    # In the capture, it moves with it.
+    # A folder inside of the capture moves with it.
     capture.rename(tmp_path / "moved")
     moved = Run.open(tmp_path / "inside").with_scene_at(tmp_path / "moved")
     assert found(option, moved.scene()) == expected(option, tmp_path / "moved" / "inside")
 
 
-def test_folders_of_older_runs_are_found_as_before(option, capture, tmp_path, monkeypatch):
+def test_option_folders_of_older_runs_are_found(option, capture, tmp_path, monkeypatch):
     shutil.copytree(tmp_path / "cut", capture / "inside")
     for name in ("cut", "inside"):
         begun(capture, tmp_path / f"run_{name}", **{option: str(capture / "inside")})
@@ -90,7 +90,7 @@ def test_folders_of_older_runs_are_found_as_before(option, capture, tmp_path, mo
         assert found(option, Run.open(tmp_path / f"run_{name}").scene()) == expected(option, folder)
 
 
-def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_scene, run_copy, capsys):
+def test_resuming_reports_ignored_options(tiny_scene, run_copy, capsys):
     own = Run.open(run_copy).train_options
     words = f"train {tiny_scene} -o {run_copy} --resume --effects auto --effect exposure=on"
     assert own.iterations != 7000 and own.max_primitives == 300
@@ -102,14 +102,14 @@ def test_options_that_a_resumed_run_cannot_take_are_named_in_one_sentence(tiny_s
     assert line.strip() == f"--resume goes on with the run's own options: {flags} ignored"
 
 
-def test_a_resumed_run_that_takes_everything_says_nothing(tiny_scene, run_copy, capsys):
+def test_resuming_without_ignored_options_reports_nothing(tiny_scene, run_copy, capsys):
     assert main(["train", str(tiny_scene), "-o", str(run_copy), "--resume", "--threads", "1"]) == 0
     assert "ignored" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("asked", [{}, {"lens": False}, {"masks": False}])
-def test_a_capture_is_read_once_where_effects_do_not_change_how(asked, tmp_path, monkeypatch):
-    """Points and poses of a second reading would cost as much as a short training."""
+def test_a_capture_is_read_once_unless_effects_change_how(asked, tmp_path, monkeypatch):
+    """Reading points and poses twice would take as long as a short training."""
     write_colmap(tmp_path / "capture")
     read = []
     monkeypatch.setattr("linprim_geo.training.start.load_scene", lambda *a, **k: read.append(a) or load_scene(*a, **k))

@@ -1,4 +1,4 @@
-"""Surfaces that stereo finds before a training: what it starts on, and what it is held to."""
+"""Stereo before a training: start points, depth maps for the loss, and detection of sky."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def held(room, tmp_path_factory) -> Run:
     return trained(room, tmp_path_factory.mktemp("held") / "run")
 
 
-def test_there_are_points_where_some_are_missing_and_maps_where_training_is_held(room):
+def test_points_and_maps_are_computed_only_if_needed(room):
     scene = load_scene(room)
     found = stereo_surfaces(scene, OPTIONS, QUIET)
-    assert found.points is not None and len(found.points.xyz) == 900  # 0.8 of 1500 are wanted, and 300 are there
+    assert found.points is not None and len(found.points.xyz) == 900  # 0.8 of 1500 are required, 300 are given
     assert [each.view.name for each in found.maps] == [view.name for view in scene.train]
     assert stereo_surfaces(scene, OPTIONS, QUIET, started=True).points is None
     for enough in ({"max_primitives": 300}, {"start": "points"}):
@@ -61,7 +61,7 @@ def test_there_are_points_where_some_are_missing_and_maps_where_training_is_held
     assert not stereo_surfaces(masked, replace(OPTIONS, start="points"), QUIET).maps
 
 
-def test_a_sky_that_three_views_show_is_trained_as_an_environment(room, monkeypatch, tmp_path):
+def test_a_sky_in_three_views_makes_an_environment(room, monkeypatch, tmp_path):
     scene = load_scene(room)
     found = stereo_surfaces(scene, OPTIONS, QUIET)
     assert not found.sky and not any(each.shows_sky for each in found.maps)
@@ -85,13 +85,13 @@ def sky_of(scene, maps, monkeypatch, **changed) -> bool:
     return stereo_surfaces(scene, replace(OPTIONS, **changed), QUIET).sky
 
 
-def test_stereo_that_most_points_contradict_says_nothing(room):
+def test_stereo_contradicted_by_most_points_is_discarded(room):
     scene = load_scene(room)
     maps = stereo_surfaces(scene, OPTIONS, QUIET).maps
     points = scene.points.xyz
     assert contradicting(maps, points) < 0.4
     assert contradicting(maps, points[:0]) == 0
-    # Points that are nearer to the middle by a tenth, as if stereo were wrong everywhere.
+    # Moving all points by a tenth towards the centre contradicts stereo everywhere.
     middle = np.mean([view.camera.center for view in scene.train], axis=0)
     elsewhere = replace(scene.points, xyz=middle + 0.9 * (points - middle))
     assert contradicting(maps, elsewhere.xyz) > 0.8
@@ -99,7 +99,7 @@ def test_stereo_that_most_points_contradict_says_nothing(room):
 
 
 def error_at_stereo(run: Run) -> float:
-    """By how much depths of the training views miss those of stereo."""
+    """Error of rendered depths of the training views against those of stereo."""
     scene = run.scene()
     maps = stereo_surfaces(scene, OPTIONS, QUIET).maps
     depths = [torch.from_numpy(depth) for _, depth, _ in run.surface_depths(scene.train, 0.5)]
@@ -110,7 +110,7 @@ def error_at_stereo(run: Run) -> float:
     return float(np.mean(errors))
 
 
-def test_a_training_is_held_to_them(room, tmp_path):
+def test_stereo_depth_reduces_the_error_against_stereo(room, tmp_path):
     held = trained(room, tmp_path / "held", iterations=400)
     free = trained(room, tmp_path / "free", iterations=400, stereo_depth=0.0)
     assert held.train_options.stereo_depth == 1 and free.train_options.stereo_depth == 0
@@ -118,7 +118,7 @@ def test_a_training_is_held_to_them(room, tmp_path):
     assert error_at_stereo(held) < 0.75 * error_at_stereo(free)
 
 
-def test_a_training_that_is_held_resumes_to_the_last_bit(room, held, tmp_path):
+def test_resuming_with_stereo_depth_repeats_the_run_bit_for_bit(room, held, tmp_path):
     from linprim_geo.training.train import train
 
     again = trained(room, tmp_path / "run")
@@ -132,7 +132,7 @@ def test_a_training_that_is_held_resumes_to_the_last_bit(room, held, tmp_path):
     )
 
 
-def test_stereo_that_does_not_fit_into_the_time_holds_no_resumed_training_either(room, tmp_path, monkeypatch):
+def test_stereo_that_exceeds_the_time_budget_is_recorded_as_off(room, tmp_path, monkeypatch):
     from linprim_geo.training.train import train
 
     monkeypatch.setattr(module, "_fits", lambda *_: False)

@@ -1,4 +1,4 @@
-"""Time budgets: what is chosen from a cost, in closed form; that a run keeps its time and repeats itself; errors."""
+"""Time budgets: plans in closed form, runs that keep their time and are reproducible, and errors."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ MANY = 10**9
 # --- what is chosen --------------------------------------------------------------------------------------
 
 
-def test_a_line_goes_through_both_calibrations():
+def test_step_cost_is_a_line_through_both_calibrations():
     cost = StepCost.fit((100, 0.002), (500, 0.004))
     assert (cost.base, cost.per_primitive) == pytest.approx((0.0015, 5e-6))
     assert cost.seconds(1000) == pytest.approx(0.0065)
-    assert StepCost.fit((100, 0.004), (500, 0.002)) == StepCost(0.003, 0.0)  # noise: no slope
+    assert StepCost.fit((100, 0.004), (500, 0.002)) == StepCost(0.003, 0.0)  # negative slope by noise
     assert StepCost.fit((100, 0.001), (500, 0.010)) == StepCost(0.0, 2e-5)  # more than in proportion
     assert StepCost(0.01, 0.0, late=3.0, late_share=0.25).seconds(5) == pytest.approx(0.015)
 
 
-def test_the_mean_population_is_that_of_exponential_growth():
+def test_mean_population_agrees_with_exponential_growth():
     share = np.linspace(0, 1, 200_001)
     population = np.minimum(1, 0.25 * 4 ** (share / 0.54))
     assert mean_population(0.25) == pytest.approx(population.mean(), abs=1e-4)
@@ -63,14 +63,14 @@ def test_the_mean_population_is_that_of_exponential_growth():
 
 @pytest.mark.parametrize("start", [0.25, 0.8, 1.0])
 @pytest.mark.parametrize("cost", [StepCost(0.004, 1e-6), StepCost(0.0, 2e-6), StepCost(0.003, 1e-6, 2.0, 0.3)])
-def test_the_plan_fills_the_time_at_the_stated_ratio(cost, start):
+def test_the_plan_fills_the_time_with_the_given_ratio_of_steps(cost, start):
     plan = plan_training(120.0, cost, start, MANY)
     assert plan.iterations / plan.max_primitives == pytest.approx(STEPS_PER_PRIMITIVE, rel=2e-3)
     taken = plan.iterations * cost.seconds(mean_population(start) * plan.max_primitives)
     assert taken == pytest.approx(120, rel=2e-3) and plan.seconds == pytest.approx(taken)
 
 
-def test_without_a_slope_the_plan_is_the_time_over_the_step():
+def test_the_plan_for_constant_cost_per_step():
     assert STEPS_PER_PRIMITIVE > 0
     plan = plan_training(10.0, StepCost(0.002, 0.0), 1.0, MANY)
     assert plan.iterations == pytest.approx(5000, abs=1) and plan.max_primitives == pytest.approx(
@@ -78,7 +78,7 @@ def test_without_a_slope_the_plan_is_the_time_over_the_step():
     )
 
 
-def test_limits_of_the_population_leave_the_rest_to_the_steps():
+def test_the_plan_respects_limits_of_primitives_and_steps():
     cost = StepCost(0.001, 1e-6)
     few = plan_training(1000.0, cost, 1.0, 4000)
     assert (few.max_primitives, few.iterations) == (4000, 200_000) and "pixels" in few.why
@@ -89,7 +89,7 @@ def test_limits_of_the_population_leave_the_rest_to_the_steps():
     assert plan_training(LEAST_STEPS * cost.seconds(LEAST_PRIMITIVES) * 0.99, cost, 1.0, MANY) is None
 
 
-def test_what_is_given_is_kept():
+def test_given_steps_or_primitives_are_kept():
     cost = StepCost(0.001, 1e-6)
     assert plan_training(20.0, cost, 1.0, MANY, max_primitives=3000).iterations == 5000
     plan = plan_training(20.0, cost, 1.0, MANY, iterations=5000)
@@ -98,21 +98,21 @@ def test_what_is_given_is_kept():
     assert plan_training(-1.0, cost, 1.0, MANY) is plan_training(-1.0, cost, 1.0, MANY, max_primitives=500) is None
 
 
-def test_the_correction_fills_what_is_left():
+def test_the_correction_fills_the_remaining_time():
     assert corrected_steps(600, 1000, 0.01, 4.0) == 1000
     assert corrected_steps(600, 1000, 0.02, 4.0) == 800
     assert corrected_steps(600, 1000, 0.01, -5.0) == 600 + 400 / LARGEST_CORRECTION
     assert corrected_steps(600, 1000, 0.01, 1e9) == 600 + 400 * LARGEST_CORRECTION
 
 
-def test_the_voxel_fills_the_time():
+def test_the_planned_voxel_size_fills_the_time():
     cost = VoxelCost.fit([(0.4, 1.0 + 0.08 / 0.16), (0.2, 1.0 + 0.08 / 0.04)])
     assert (cost.base, cost.per_area) == pytest.approx((1.0, 0.08))
     voxel = plan_voxel(9.0, cost, 1e-3, 0.4)
     assert voxel == pytest.approx(0.1, rel=0.01) and cost.seconds(voxel) <= 9.0
     assert plan_voxel(1e6, cost, 0.05, 0.4) == pytest.approx(0.05)
     assert plan_voxel(1.4, cost, 0.05, 0.4) is None
-    assert VoxelCost.fit([(0.4, 2.0)]).seconds(0.2) == pytest.approx(8.0)  # one pass: all of it area
+    assert VoxelCost.fit([(0.4, 2.0)]).seconds(0.2) == pytest.approx(8.0)  # one pass: all cost is per area
     assert VoxelCost.fit([(0.4, 2.0), (0.2, 1.0)]).seconds(0.1) == pytest.approx(4.0)  # noise
 
 
@@ -126,7 +126,7 @@ def trainer(tiny_scene, tiny_run):
     return start_trainer(run.scene(), run, images, run.train_options, None)
 
 
-def test_a_correction_stretches_what_is_left_of_the_schedule(trainer):
+def test_a_correction_stretches_the_remaining_schedule(trainer):
     planned = trainer.options.iterations
     plain = []
     for trainer.step in range(planned):
@@ -151,7 +151,7 @@ OPTIONS = TrainOptions(sh_degree=0, threads=1, evaluate_every=0, checkpoint_ever
 
 @pytest.fixture(scope="module")
 def budgeted(tiny_scene, tmp_path_factory):
-    """A run with a budget, of 12 s unless the machine is too busy for that, that budget, and the seconds it took."""
+    """(run, result, budget, seconds) of a run with a budget of 12 s, or more on a busy machine."""
     run = tmp_path_factory.mktemp("budget") / "run"
 
     def timed(budget):
@@ -162,7 +162,7 @@ def budgeted(tiny_scene, tmp_path_factory):
     return run, result, budget, seconds
 
 
-def test_a_run_keeps_its_time(budgeted):
+def test_a_run_stays_within_its_time_budget(budgeted):
     run, result, budget, seconds = budgeted
     # A loaded machine changes its pace by a factor of two or three within such a time, after the one correction too.
     assert 5 / 12 * budget < seconds < 2 * budget
@@ -180,8 +180,8 @@ def test_a_run_keeps_its_time(budgeted):
     assert result["psnr"] > 20
 
 
-def test_a_run_with_a_correction_repeats_itself_after_a_kill(tiny_scene, tmp_path, monkeypatch):
-    """Killed before and after the correction: what is recorded is repeated, to the last bit."""
+def test_resuming_with_a_correction_repeats_the_run_bit_for_bit(tiny_scene, tmp_path, monkeypatch):
+    """The run is killed after the correction at step 120, and resumed from checkpoints of steps 120 and 150."""
     options = replace(OPTIONS, iterations=200, max_primitives=100, checkpoint_every=50)
     cost = StepCost(0.001, 0.0)
     monkeypatch.setattr(pacing, "calibrate", lambda *_: (cost, 1.0, 0.0, 0.0))
@@ -209,7 +209,7 @@ def test_a_run_with_a_correction_repeats_itself_after_a_kill(tiny_scene, tmp_pat
         assert_same_run(whole, killed)
 
 
-def test_a_kill_right_before_the_correction_is_followed_by_it(tiny_scene, tmp_path, monkeypatch):
+def test_a_run_killed_before_the_correction_is_corrected_on_resume(tiny_scene, tmp_path, monkeypatch):
     monkeypatch.setattr(pacing, "calibrate", lambda *_: (StepCost(0.001, 0.0), 1.0, 0.0, 0.0))
     monkeypatch.setattr(pacing, "plan_training", lambda *_, **__: time_budget.TrainingPlan(200, 100, 1.0, "a test"))
 
@@ -224,7 +224,7 @@ def test_a_kill_right_before_the_correction_is_followed_by_it(tiny_scene, tmp_pa
     assert train(tiny_scene, tmp_path / "run", resume=True, quiet=True)["iterations"] == 150
 
 
-def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
+def test_an_extraction_stays_within_its_time_budget(tiny_run, tmp_path):
     begin = time.monotonic()
     stats = extract_mesh(
         tiny_run, output=tmp_path / "mesh.ply", options=ExtractOptions(level=0.5), time_budget=30.0, quiet=True
@@ -243,8 +243,8 @@ def test_an_extraction_keeps_its_time(tiny_run, tmp_path):
     )
 
 
-def test_a_budget_that_fits_a_coarser_surface_gets_one(tiny_run, tmp_path, monkeypatch):
-    """With passes that cost 1 + 1e-2 / voxel^2 s, and none left for the finest."""
+def test_a_small_budget_gives_a_coarser_surface(tiny_run, tmp_path, monkeypatch):
+    """Passes are assumed to take 1 + c / voxel^2 seconds, too long for the finest voxels."""
     cost = VoxelCost(1.0, 1e-2)
     monkeypatch.setattr(voxel_budget, "_timed_pass", lambda run, options, *_: cost.seconds(options.voxel_size))
     supported = extract_mesh(tiny_run, output=tmp_path / "a.ply", options=ExtractOptions(level=0.5), quiet=True)[
@@ -266,21 +266,21 @@ def test_a_budget_that_fits_a_coarser_surface_gets_one(tiny_run, tmp_path, monke
 # --- errors ----------------------------------------------------------------------------------------------
 
 
-def test_too_little_time_is_one_sentence_and_leaves_nothing(tiny_scene, tmp_path):
+def test_too_little_time_is_refused_and_leaves_nothing(tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match=r"--time-budget is 0.1 s, but the least training .* takes \d+ s here"):
         train(tiny_scene, tmp_path / "run", options=OPTIONS, time_budget=0.1, quiet=True)
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, math.nan, math.inf])
-def test_a_time_has_to_be_positive(seconds, tiny_scene, tmp_path):
+def test_budgets_that_are_not_positive_are_refused(seconds, tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match="--time-budget is .* wanted a positive time"):
         Budget(seconds)
     with pytest.raises(LinprimError, match="--time-budget"):
         train(tiny_scene, tmp_path / "run", time_budget=seconds, quiet=True)
 
 
-def test_a_budget_needs_something_to_choose(tiny_scene, tiny_run, tmp_path):
+def test_a_budget_without_free_options_is_refused(tiny_scene, tiny_run, tmp_path):
     with pytest.raises(LinprimError, match="nothing to choose"):
         train(
             tiny_scene,
@@ -295,7 +295,7 @@ def test_a_budget_needs_something_to_choose(tiny_scene, tiny_run, tmp_path):
         extract_mesh(tiny_run, "polyhedra", time_budget=5.0, quiet=True)
 
 
-def test_times_are_read_as_people_write_them(capsys):
+def test_times_are_parsed_with_units(capsys):
     assert [seconds(text) for text in ("90", "90s", "5m", "1.5h")] == [90, 90, 300, 5400]
     for wrong in ("", "m", "0", "-5s", "5 minutes", "nan", "inf"):
         with pytest.raises(SystemExit) as leaving:
@@ -304,5 +304,5 @@ def test_times_are_read_as_people_write_them(capsys):
     assert "--time-budget" in capsys.readouterr().err
 
 
-def test_without_a_budget_nothing_is_noted(tiny_run):
+def test_runs_without_a_budget_record_none(tiny_run):
     assert "time_budget" not in json.loads((tiny_run / "config.json").read_text())

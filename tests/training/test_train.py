@@ -1,4 +1,4 @@
-"""Training: what a run leaves behind, every kind of capture and of primitive, and the data set's frame."""
+"""Training: files of a run, kinds of captures and primitives, and the coordinates of the data set."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from linprim_geo.training.train import train
 # --- what a run leaves behind ----------------------------------------------------------------------------
 
 
-def test_a_run_learns_and_says_so(tiny_run, tiny_options):
+def test_loss_falls_and_metrics_are_recorded(tiny_run, tiny_options):
     lines = [json.loads(line) for line in (tiny_run / "metrics.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [100, 200, 300, 400]
     assert lines[-1]["loss"] < 0.7 * lines[0]["loss"] and lines[-1]["train_psnr"] > lines[0]["train_psnr"]
@@ -50,12 +50,12 @@ def test_a_run_learns_and_says_so(tiny_run, tiny_options):
     assert (state["iteration"], state["primitives"]) == (400, len(load_primitives(tiny_run / "scene.npz")))
 
 
-def test_the_score_is_the_one_that_eval_images_finds(tiny_run, tmp_path):
+def test_the_recorded_psnr_equals_that_of_eval_images(tiny_run, tmp_path):
     scored = eval_images_run(tiny_run, output=tmp_path)
     assert scored["psnr"] == pytest.approx(metrics(tiny_run)[-1]["psnr"], abs=2e-3)
 
 
-def test_only_the_last_checkpoints_are_kept_and_they_hold_tensors_alone(tiny_run):
+def test_the_last_two_checkpoints_are_kept_and_load_with_weights_only(tiny_run):
     folder = tiny_run / "checkpoints"
     assert sorted(path.name for path in folder.iterdir()) == ["latest", "step_000300.pt", "step_000400.pt"]
     state = checkpoint(tiny_run)  # weights_only: no code is run
@@ -63,7 +63,7 @@ def test_only_the_last_checkpoints_are_kept_and_they_hold_tensors_alone(tiny_run
     assert state["first"].keys() == state["second"].keys() == state["parameters"].keys()
 
 
-def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
+def test_exported_primitives_equal_the_checkpoint(tiny_run):
     with torch.no_grad():
         tensors = activate(checkpoint(tiny_run)["parameters"], 1)
     saved = load_primitives(tiny_run / "training_frame.npz")
@@ -78,7 +78,7 @@ def test_the_checkpoint_and_the_exported_primitives_agree(tiny_run):
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """Seen from inside: opaque images, no alpha."""
+    """A room seen from inside: opaque images without alpha."""
     out = tmp_path_factory.mktemp("room") / "scene"
     synthesize(out, shape="cad", views=10, test_views=2, size=40, points=300, supersample=1, background="0.2,0.6,0.4")
     return out
@@ -93,20 +93,20 @@ def test_the_background_of_opaque_images_is_fitted(room, tmp_path):
     assert checkpoint(tmp_path / "run")["parameters"]["background"].shape == (3,)
 
 
-def test_a_background_that_is_given_is_kept(room, tmp_path):
+def test_a_given_background_is_kept(room, tmp_path):
     train(room, tmp_path / "run", options=replace(QUICK, background="0.2,0.6,0.4"), quiet=True)
     assert np.allclose(Run.open(tmp_path / "run").background, [0.2, 0.6, 0.4])
     assert "background" not in checkpoint(tmp_path / "run")["parameters"]
 
 
 @pytest.mark.parametrize("text", ["blue", "0.1,0.2", "0,0,2", "nan,0,0", ""])
-def test_a_background_that_makes_no_sense_is_refused(text, room, tmp_path):
+def test_invalid_backgrounds_are_refused(text, room, tmp_path):
     with pytest.raises(LinprimError, match="--background"):
         train(room, tmp_path / "run", options=replace(QUICK, background=text), quiet=True)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_scene_without_held_out_views(tmp_path):
+def test_training_without_held_out_views(tmp_path):
     scene = tmp_path / "scene"
     synthesize(scene, views=2, test_views=0, size=32, points=100, supersample=1)
     (scene / "transforms_test.json").unlink(missing_ok=True)
@@ -119,7 +119,7 @@ def test_a_scene_without_held_out_views(tmp_path):
 
 
 def clear(paths):
-    """Makes images transparent, and masks empty."""
+    """Make images transparent and masks empty."""
     for path in paths:
         with Image.open(path) as image:
             pixels = np.array(image)
@@ -129,14 +129,14 @@ def clear(paths):
 
 @pytest.fixture
 def scene_copy(tiny_scene, tmp_path):
-    """A copy of `tiny_scene` without its folder of masks, which say the same as the alpha of the images."""
+    """A copy of `tiny_scene` without its masks, which duplicate the alpha of the images."""
     scene = shutil.copytree(tiny_scene, tmp_path / "copy")
     shutil.rmtree(scene / "masks")
     return scene
 
 
 @pytest.mark.parametrize("source", ["masks", "train"])
-def test_masks_that_leave_nothing_are_one_sentence(source, tiny_scene, tmp_path):
+def test_empty_masks_are_refused(source, tiny_scene, tmp_path):
     scene_copy = shutil.copytree(tiny_scene, tmp_path / "copy")
     if source == "masks":
         clear((scene_copy / "masks").rglob("*.png"))
@@ -148,12 +148,12 @@ def test_masks_that_leave_nothing_are_one_sentence(source, tiny_scene, tmp_path)
     assert not (tmp_path / "run").exists()
 
 
-def test_one_image_without_foreground_is_fine(scene_copy, tmp_path):
+def test_one_image_without_foreground_is_accepted(scene_copy, tmp_path):
     clear([scene_copy / "train" / "003.png"])
     assert train(scene_copy, tmp_path / "run", options=QUICK, quiet=True)["iterations"] == 12
 
 
-def test_a_colmap_model_alone(scene_copy, tmp_path):
+def test_training_on_a_colmap_model(scene_copy, tmp_path):
     for path in scene_copy.iterdir():
         if path.name not in ("sparse", "train"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -163,7 +163,7 @@ def test_a_colmap_model_alone(scene_copy, tmp_path):
     assert Run.open(tmp_path / "run").scene().kind == "colmap"
 
 
-def test_no_points_start_from_the_masks(scene_copy, tmp_path):
+def test_training_without_points_starts_from_masks(scene_copy, tmp_path):
     shutil.rmtree(scene_copy / "sparse")
     (scene_copy / "points3D.ply").unlink()
     for name in ("transforms_train.json", "transforms_test.json"):
@@ -174,8 +174,8 @@ def test_no_points_start_from_the_masks(scene_copy, tmp_path):
     assert result["psnr"] > 18.5  # 19.56 to 20.04
 
 
-def test_an_off_centre_principal_point(tmp_path):
-    # Far enough that the shifted image still holds all of it.
+def test_training_with_an_off_centre_principal_point(tmp_path):
+    # The distance is large enough for the shifted image to contain the whole object.
     synthesize(
         tmp_path / "scene",
         shape="cad",
@@ -192,7 +192,7 @@ def test_an_off_centre_principal_point(tmp_path):
     run = Run.open(tmp_path / "run")
     views = run.scene().test
     assert all((view.camera.cx, view.camera.cy) == (26, 16) for view in views)
-    # With the principal point ignored images are those of the middle, 7 pixels away.
+    # Ignoring the principal point shifts images by 7 pixels.
     ignored = [replace(view, camera=replace(view.camera, cx=20.0, cy=20.0)) for view in views]
     error = []
     for cameras in (views, ignored):
@@ -202,7 +202,7 @@ def test_an_off_centre_principal_point(tmp_path):
     assert error[0] < 0.5 * error[1]
 
 
-def test_cameras_of_two_sizes(tmp_path):
+def test_training_with_cameras_of_two_sizes(tmp_path):
     wide, tall = tmp_path / "wide", tmp_path / "tall"
     synthesize(wide, shape="cad", views=8, test_views=2, size=(48, 32), points=300, supersample=1)
     synthesize(tall, shape="cad", views=8, test_views=2, size=(28, 40), points=10, supersample=1)
@@ -222,13 +222,13 @@ def test_cameras_of_two_sizes(tmp_path):
     assert result["views"] == 4 and result["psnr"] > 20.6  # 21.64 to 22.54
 
 
-def test_downscaled_photographs(tiny_scene, tmp_path):
+def test_training_on_downscaled_photographs(tiny_scene, tmp_path):
     result = train(tiny_scene, tmp_path / "run", SceneOptions(downscale=2), replace(QUICK, iterations=100), quiet=True)
     assert Run.open(tmp_path / "run").scene().train[0].camera.width == 24
     assert result["psnr"] > 18.8  # 19.87 to 20.49
 
 
-def test_a_run_keeps_how_large_photographs_were_averaged_down(tiny_scene, tmp_path, monkeypatch):
+def test_a_run_records_the_automatic_downscale(tiny_scene, tmp_path, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("linprim_geo.capture.load.LONGEST_SIDE", 24)
         train(tiny_scene, tmp_path / "run", options=replace(QUICK, iterations=3), quiet=True)
@@ -248,7 +248,7 @@ def test_the_population_never_exceeds_its_limit(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_the_degree_of_the_colour_is_what_was_asked_for(degree, tiny_scene, tmp_path):
+def test_the_sh_degree_is_the_requested_one(degree, tiny_scene, tmp_path):
     options = replace(QUICK, iterations=40, sh_degree=degree)
     train(tiny_scene, tmp_path / "run", options=options, quiet=True)
     octahedra = load_primitives(tmp_path / "run" / "scene.npz")
@@ -289,7 +289,7 @@ def test_an_option_out_of_range_is_refused(wrong, tiny_scene, tmp_path):
         ({"primitive": "gaussian", "order": "entry"}, "wanted center with --primitive gaussian"),
     ],
 )
-def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, tiny_scene, tmp_path):
+def test_incompatible_kinds_and_rules_are_refused(wrong, sentence, tiny_scene, tmp_path):
     with pytest.raises(LinprimError, match=sentence):
         train(tiny_scene, tmp_path / "run", options=replace(QUICK, **wrong), quiet=True)
     assert not (tmp_path / "run").exists()
@@ -302,7 +302,7 @@ def test_kinds_and_rules_that_do_not_go_together_are_refused(wrong, sentence, ti
     ("population", "adam"), [("gradient", "dense"), ("gradient", "sparse"), ("3dgs", "dense"), ("mcmc", "sparse")]
 )
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, population, adam, tiny_scene, tmp_path):
+def test_every_kind_learns_under_every_rule_and_resumes_bit_for_bit(kind, population, adam, tiny_scene, tmp_path):
     options = TrainOptions(
         iterations=300,
         max_primitives=260,
@@ -324,7 +324,7 @@ def test_every_kind_learns_under_every_rule_and_goes_on_bit_for_bit(kind, popula
     # A reset of the opacities, at step 129, costs 3dgs most of what it had learnt.
     assert population == "3dgs" or lines[-1]["loss"] < 0.8 * lines[0]["loss"]
     assert 200 < result["primitives"] <= 260
-    # What is saved is what was rendered: the filter is in it.
+    # Saved primitives include the filter, as rendered ones do.
     state, saved = checkpoint(whole), load_primitives(whole / "training_frame.npz")
     assert saved.kind == kind and len(saved) == len(state["filter_3d"])
     with torch.no_grad():
@@ -351,7 +351,7 @@ HOW = [
 
 
 @pytest.mark.parametrize(("kind", "ray_model", "order", "smooth"), HOW)
-def test_every_way_of_rendering_trains_and_is_used_by_renders(kind, ray_model, order, smooth, tiny_scene, tmp_path):
+def test_every_way_of_rendering_trains_and_is_used_for_scores(kind, ray_model, order, smooth, tiny_scene, tmp_path):
     options = replace(
         QUICK,
         iterations=150,
@@ -384,14 +384,14 @@ def test_surfaces_of_every_kind_can_be_extracted(kind, ray_model, tiny_scene, tm
 # --- the data set's frame ---------------------------------------------------------------------------------
 
 
-def test_the_frame_of_the_data_set_comes_back(tmp_path):
+def test_results_are_in_the_coordinates_of_the_data_set(tmp_path):
     from linprim_geo.synthetic.shapes import smooth_body
 
     body, scale, offset = smooth_body(), 100.0, np.array([1e4, -2e4, 5e3])
     results, depths, clouds = [], [], []
     for name, factor, shift in (("near", 1.0, np.zeros(3)), ("far", scale, offset)):
         center = body.center
-        # The texture is a function of the place in the shape's own frame, so it is asked for there.
+        # The texture is a function of position in the coordinates of the shape.
         moved = TexturedMesh(
             name,
             body.vertices * factor + shift,
@@ -411,7 +411,7 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
         clouds.append(load_primitives(run / "scene.npz"))
         score = eval_depth_run(run, scene / "reference.ply")
         assert score["abs_rel"] < 0.05 and score["coverage"] > 0.9
-    # Not the same: positions were rounded in other places, and a training amplifies that.
+    # Rounding of positions differs, and training amplifies it, so results are not equal.
     assert min(results) > 26.0  # 27.09 to 29.54
     both = (depths[0] > 0) & (depths[1] > 0)
     assert both.mean() > 0.1
@@ -429,7 +429,7 @@ def test_the_frame_of_the_data_set_comes_back(tmp_path):
 @pytest.mark.parametrize(
     ("background", "words"), [("random", "random colours"), ("fitted", "plain backdrop"), ("white", "one colour")]
 )
-def test_a_run_says_what_it_puts_behind_everything(tiny_scene, tmp_path, capsys, background, words):
+def test_the_command_reports_the_background(tiny_scene, tmp_path, capsys, background, words):
     options = ["--iterations", "2", "--max-primitives", "50", "--threads", "1", "--background", background]
     assert main(["train", str(tiny_scene), "-o", str(tmp_path / "run"), *options]) == 0
     assert words in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Training that is interrupted: going on after a kill bit for bit, damaged folders, full disks, divergence."""
+"""Interrupted trainings: resumption bit for bit, damaged folders, full disks, and divergence."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ from linprim_geo.training.train import train
 # --- going on ---------------------------------------------------------------------------------------------
 
 
-def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
-    # Growth, colour of degree 1, a random background: everything that draws random numbers or has state.
+def test_resuming_a_killed_run_repeats_it_bit_for_bit(tiny_scene, tmp_path):
+    # Growth, SH degree 1 and a random background cover everything with random numbers or state.
     options = TrainOptions(
         iterations=200,
         max_primitives=260,
@@ -58,7 +58,7 @@ def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
     process.communicate()
     assert process.returncode == -signal.SIGKILL
     assert checkpoint(killed)["step"] < 200
-    # Stereo finds nothing in photographs as small.
+    # Stereo finds nothing in such small photographs.
     assert Run.open(killed).train_options == replace(options, stereo_depth=0.0, dropout=0.0)
     result = train(tiny_scene, killed, resume=True, quiet=True)
     assert result["iterations"] == 200 and result["primitives"] == 260
@@ -66,7 +66,7 @@ def test_a_killed_run_goes_on_bit_for_bit(tiny_scene, tmp_path):
 
 
 @pytest.mark.parametrize("torn", ["before the first checkpoint", "before the last export", "in a line of metrics"])
-def test_a_kill_at_the_worst_moment_loses_nothing(torn, tiny_scene, tiny_run, run_copy):
+def test_resuming_after_a_kill_at_critical_moments_repeats_the_run(torn, tiny_scene, tiny_run, run_copy):
     if torn == "before the first checkpoint":
         for path in run_copy.iterdir():
             if path.name not in ("config.json", "transform.json"):
@@ -82,8 +82,8 @@ def test_a_kill_at_the_worst_moment_loses_nothing(torn, tiny_scene, tiny_run, ru
     assert_same_run(tiny_run, run_copy)
 
 
-def test_an_empty_folder_is_begun_anew(tiny_scene, tmp_path):
-    # What a kill between making the folder and its lock leaves.
+def test_resuming_an_empty_folder_starts_a_run(tiny_scene, tmp_path):
+    # A kill between making the folder and its lock leaves it empty.
     (tmp_path / "run").mkdir()
     train(tiny_scene, tmp_path / "run", options=QUICK, resume=True, quiet=True)
     assert checkpoint(tmp_path / "run")["step"] == QUICK.iterations
@@ -101,7 +101,7 @@ def test_the_result_does_not_depend_on_the_number_of_threads(tiny_scene, tiny_ru
     assert_same_run(tiny_run, tmp_path / "run")
 
 
-def test_another_seed_is_another_run(tiny_scene, tmp_path):
+def test_different_seeds_give_different_runs(tiny_scene, tmp_path):
     for seed in (0, 1):
         train(tiny_scene, tmp_path / str(seed), options=replace(QUICK, seed=seed), quiet=True)
     first, second = (load_primitives(tmp_path / str(seed) / "scene.npz") for seed in (0, 1))
@@ -122,7 +122,7 @@ def test_ctrl_c_leaves_a_usable_run(tiny_scene, tmp_path):
     state = checkpoint(run)
     assert state["step"] >= 100 and Run.open(run).state["iteration"] == state["step"]
     assert eval_images_run(run)["psnr"] > 10
-    # It goes on from there: interrupted again after five steps, by hand this time.
+    # Resumption starts at this step; it is stopped after five steps.
     steps = []
 
     class Stop(Exception):
@@ -140,13 +140,13 @@ def test_ctrl_c_leaves_a_usable_run(tiny_scene, tmp_path):
     assert steps == list(range(state["step"], state["step"] + 5))
 
 
-def test_signal_handlers_are_put_back(tiny_scene, tmp_path):
+def test_signal_handlers_are_restored(tiny_scene, tmp_path):
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     train(tiny_scene, tmp_path / "run", options=QUICK, quiet=True)
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
-def test_an_existing_folder_is_refused_before_anything_is_done(tiny_scene, tiny_run, tmp_path):
+def test_an_existing_folder_is_refused_and_unchanged(tiny_scene, tiny_run, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
     with pytest.raises(LinprimError, match="exists already.*--resume"):
         train(tiny_scene, tiny_run, options=QUICK, quiet=True)
@@ -156,7 +156,7 @@ def test_an_existing_folder_is_refused_before_anything_is_done(tiny_scene, tiny_
     assert {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")} == before
 
 
-def test_resume_wants_a_run_and_its_own_scene(tiny_scene, tiny_run, tmp_path):
+def test_resume_refuses_missing_runs_and_other_scenes(tiny_scene, tiny_run, tmp_path):
     with pytest.raises(LinprimError, match="nothing: no such folder"):
         train(tiny_scene, tmp_path / "nothing", resume=True, quiet=True)
     (tmp_path / "other").mkdir()
@@ -185,7 +185,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_checkpoint_is_one_sentence(damage, tiny_scene, run_copy):
+def test_damaged_checkpoints_are_refused(damage, tiny_scene, run_copy):
     DAMAGE[damage](run_copy / "checkpoints")
     kept = (run_copy / "scene.npz").read_bytes()
     with pytest.raises(LinprimError) as caught:
@@ -194,7 +194,7 @@ def test_a_damaged_checkpoint_is_one_sentence(damage, tiny_scene, run_copy):
     assert (run_copy / "scene.npz").read_bytes() == kept
 
 
-def test_damaged_options_of_a_run_are_one_sentence(tiny_scene, run_copy):
+def test_damaged_options_of_a_run_are_refused(tiny_scene, run_copy):
     config = json.loads((run_copy / "config.json").read_text())
     for change in ({"iterations": "sixty"}, {"iterations": -3}, {"sh_degree": 9}, {"background": [1, 2]}):
         damaged = config | {"train_options": config["train_options"] | change}
@@ -203,8 +203,8 @@ def test_damaged_options_of_a_run_are_one_sentence(tiny_scene, run_copy):
             train(tiny_scene, run_copy, resume=True, quiet=True)
 
 
-def test_data_that_was_moved_is_found_where_the_command_line_says(tiny_scene, run_copy, tmp_path):
-    # Only where the old place is empty: another capture is no continuation.
+def test_a_moved_data_set_is_found_by_the_command_line(tiny_scene, run_copy, tmp_path):
+    # Another capture is accepted only if the original folder is missing.
     with pytest.raises(LinprimError, match="was trained on"):
         train(shutil.copytree(tiny_scene, tmp_path / "other"), run_copy, resume=True, quiet=True)
     config = json.loads((run_copy / "config.json").read_text())
@@ -213,7 +213,7 @@ def test_data_that_was_moved_is_found_where_the_command_line_says(tiny_scene, ru
     assert Run.open(run_copy).scene_path == (tmp_path / "other").resolve()
 
 
-def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_run, run_copy):
+def test_checkpoints_are_ordered_by_number_not_by_name(tiny_run, run_copy):
     folder = run_copy / "checkpoints"
     for step in (998_000, 999_000):
         (folder / f"step_{step}.pt").touch()
@@ -233,8 +233,8 @@ def test_the_newest_checkpoint_is_kept_when_its_number_gets_a_digit_more(tiny_ru
 
 
 @pytest.mark.parametrize("how", ["flush", "rename", "write"])
-def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monkeypatch):
-    """The second checkpoint, at step 8, fails: while its file is flushed, renamed or written."""
+def test_a_full_disk_keeps_the_last_checkpoint(how, tiny_scene, tmp_path, monkeypatch):
+    """Saving the second checkpoint, at step 8, fails while its file is flushed, renamed or written."""
     import resource
 
     run, options = tmp_path / "run", replace(QUICK, checkpoint_every=4)
@@ -274,8 +274,8 @@ def test_a_full_disk_leaves_the_last_checkpoint(how, tiny_scene, tmp_path, monke
     assert_same_run(tmp_path / "whole", run)
 
 
-def test_a_folder_that_becomes_read_only_keeps_what_was_saved(tiny_scene, run_copy, monkeypatch):
-    """Root may write anywhere, so the system's answer is put in its place."""
+def test_a_read_only_folder_is_refused_and_unchanged(tiny_scene, run_copy, monkeypatch):
+    """Root may write anywhere, so errors of the system are simulated."""
     import builtins
 
     def refuse(original, says_write):
@@ -299,7 +299,7 @@ def test_a_folder_that_becomes_read_only_keeps_what_was_saved(tiny_scene, run_co
 
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf")])
-def test_divergence_is_one_sentence_and_spoils_no_checkpoint(rate, tiny_scene, tmp_path, monkeypatch):
+def test_divergence_is_reported_and_saves_no_checkpoint(rate, tiny_scene, tmp_path, monkeypatch):
     run, healthy = tmp_path / "run", training_step.RATES["center"]
 
     def advance(self, original=Trainer.advance):
@@ -316,7 +316,7 @@ def test_divergence_is_one_sentence_and_spoils_no_checkpoint(rate, tiny_scene, t
     assert Run.open(run).state["iteration"] == 7
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(tiny_scene, tmp_path):
+def test_a_folder_below_a_file_is_refused(tiny_scene, tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(LinprimError, match="file: is a file, wanted a folder"):
         train(tiny_scene, tmp_path / "file" / "run", options=QUICK, quiet=True)

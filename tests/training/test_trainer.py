@@ -1,4 +1,4 @@
-"""The trainer itself: the order of views, bounds, growth, the start, and the 3D filter."""
+"""The trainer: order of views, bounds, growth, start parameters, and the 3D filter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from linprim_geo.training.step.trainer import CONTROLS, Trainer
 from linprim_geo.training.step.training_images import TrainingImage, load_training_images
 
 
-def test_activation_gives_the_opacity_of_the_raw_value():
+def test_activation_gives_the_opacity_along_the_shortest_diagonal():
     raw = torch.tensor([-30.0, -2.0, 0.0, 3.0, 40.0])
     parameters = {
         "center": torch.zeros(5, 3),
@@ -52,7 +52,7 @@ def trainer(tiny_scene):
 
 
 @pytest.mark.parametrize("adam", ["dense", "sparse"])
-def test_what_crosses_the_near_plane_is_trained_and_pulls(trainer, adam):
+def test_primitives_across_the_near_plane_are_trained(trainer, adam):
     trainer.options = replace(trainer.options, adam=adam)
     camera = trainer.images[trainer.view_of(0)].camera
     row, names = 7, ("center", "log_extent", "sh_dc", "raw_opacity")
@@ -71,8 +71,8 @@ def test_what_crosses_the_near_plane_is_trained_and_pulls(trainer, adam):
 
 @pytest.mark.parametrize("population", ["gradient", "3dgs"])
 @pytest.mark.parametrize("shift", [0.3, -0.3])
-def test_what_crosses_the_near_plane_is_split(trainer, population, shift):
-    """Its centre before the camera or behind it."""
+def test_primitives_across_the_near_plane_are_split(trainer, population, shift):
+    """The centre is in front of the camera or behind it."""
     options = replace(trainer.options, population=population)
     trainer.control = CONTROLS[population](options, len(trainer), [s.camera for s in trainer.images], trainer.bounds)
     camera, row, extent = trainer.images[trainer.view_of(0)].camera, 7, 0.2
@@ -81,16 +81,16 @@ def test_what_crosses_the_near_plane_is_split(trainer, population, shift):
     trainer.parameters["log_extent"][row] = np.log(extent)
     trainer.parameters["raw_opacity"][row] = 0.0
     trainer.advance()
-    # Nothing else pulls.
+    # Only this primitive has a gradient.
     for table in trainer.control.accumulated.values():
         table[torch.arange(len(trainer)) != row] = 0
-    # An event of either rule, after what shorter runs leave out.
+    # At step 20 both rules have an event.
     event = trainer.control.grow(trainer.parameters, 20)
     sources, counts = np.unique(event.source, return_counts=True)
     assert sources[counts > 1].tolist() == [row] and counts.max() == 2
     places, moved = event.values["center"]
     halves = moved[event.source[places] == row]
-    # Halves of their own: not where the parent was.
+    # Halves are not at the centre of the parent.
     assert len(halves) == 2 and (np.linalg.norm(halves - center, axis=1) > 1e-3).all()
 
 
@@ -102,7 +102,7 @@ def test_every_view_is_seen_once_per_round(trainer):
 
 
 @pytest.mark.parametrize("adam", ["dense", "sparse"])
-def test_learning_rates_fall_exponentially_to_a_part_of_themselves(trainer, adam, monkeypatch):
+def test_learning_rates_decay_exponentially(trainer, adam, monkeypatch):
     given = {}
 
     def dense(parameter, grad, first, second, rate, step, **_):
@@ -114,7 +114,7 @@ def test_learning_rates_fall_exponentially_to_a_part_of_themselves(trainer, adam
     monkeypatch.setattr("linprim_geo.training.step.trainer.adam_step", dense)
     monkeypatch.setattr("linprim_geo.training.step.trainer.adam_rows", sparse)
     trainer.options = replace(trainer.options, adam=adam)
-    # What is left of each at the end of the run, which has 100 steps.
+    # Factors at the end of the run of 100 steps.
     falls = {"center": 0.02, "rotation": 0.1, "log_extent": 0.1, "raw_opacity": 0.1, "sh_dc": 0.1}
     rates = {name: [] for name in falls}
     for step in (0, 25, 50, 99):
@@ -125,13 +125,13 @@ def test_learning_rates_fall_exponentially_to_a_part_of_themselves(trainer, adam
     for name, (start, *later) in rates.items():
         assert start > 0
         assert later == pytest.approx([start * falls[name] ** part for part in (0.25, 0.5, 0.99)], rel=1e-12), name
-    # A run that is to end after 150 steps, as of step 50, stretches what is left of the fall.
+    # A correction at step 50 to 150 steps stretches the remaining decay.
     trainer.step, trainer.correction = 100, (50, 150)
     trainer.advance()
     assert given[id(trainer.parameters["center"])] == pytest.approx(rates["center"][0] * 0.02**0.75, rel=1e-12)
 
 
-def test_half_axes_stay_within_their_bounds_and_rotations_are_of_length_one(trainer):
+def test_half_axes_stay_within_bounds_and_rotations_are_normalised(trainer):
     trainer.bounds = (0.04, 0.05)
     for _ in range(5):
         trainer.advance()
@@ -140,7 +140,7 @@ def test_half_axes_stay_within_their_bounds_and_rotations_are_of_length_one(trai
     assert torch.allclose(torch.linalg.vector_norm(trainer.parameters["rotation"], dim=1), torch.ones(len(trainer)))
 
 
-def test_degrees_of_the_colour_join_one_after_the_other(trainer):
+def test_the_sh_degree_increases_during_training(trainer):
     assert trainer.degree == 0
     before = trainer.parameters["sh_rest"].clone()
     trainer.advance()
@@ -151,7 +151,7 @@ def test_degrees_of_the_colour_join_one_after_the_other(trainer):
     assert not torch.equal(trainer.parameters["sh_rest"], before)
 
 
-def test_a_child_has_its_parents_state_but_no_momentum(trainer):
+def test_children_copy_their_parent_without_momentum(trainer):
     for _ in range(3):
         trainer.advance()
     for name in ("first", "second"):
@@ -170,13 +170,13 @@ def test_a_child_has_its_parents_state_but_no_momentum(trainer):
 
 
 def before_environment(trainer, texels, count=None):
-    """The same training before an environment, of its first `count` views."""
+    """The same training with an environment, of its first `count` views."""
     parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
     images, black = trainer.images[:count], torch.zeros(3)
     return Trainer(images, parameters, trainer.options, trainer.bounds, black, False, False, environment=texels)
 
 
-def test_views_are_looked_at_together_at_parts_of_the_run(trainer, monkeypatch):
+def test_support_is_checked_at_fixed_parts_of_the_run(trainer, monkeypatch):
     looked = []
     monkeypatch.setattr(Trainer, "_check_support", lambda self: looked.append(self.step))
     for step in (0, 9, 10, 19, 34, 40, 49, 69, 98):
@@ -185,7 +185,7 @@ def test_views_are_looked_at_together_at_parts_of_the_run(trainer, monkeypatch):
     assert looked == [10, 20, 35, 50, 70]  # of 100 steps
 
 
-def test_texels_that_views_see_are_trained_and_shown(trainer):
+def test_visible_texels_are_trained_and_rendered(trainer):
     texels = torch.full((6, 4, 4, 3), 0.3)
     trained = before_environment(trainer, texels.clone())
     trained.parameters["raw_opacity"][:] = -30.0
@@ -196,7 +196,7 @@ def test_texels_that_views_see_are_trained_and_shown(trainer):
     assert 0 < change.max() < 0.01 and (change == 0).any()
 
 
-def test_texels_that_no_view_sees_take_the_colours_round_them(trainer):
+def test_unseen_texels_are_filled_from_their_surroundings(trainer):
     trained = before_environment(trainer, torch.full((6, 8, 8, 3), 0.2), count=1)
     away = texel_directions(8) @ trained.images[0].camera.rotation[2] < 0
     trained.environment[torch.from_numpy(away)] = 0.9
@@ -204,7 +204,7 @@ def test_texels_that_no_view_sees_take_the_colours_round_them(trainer):
     assert away.any() and torch.allclose(trained.environment, torch.tensor(0.2), atol=1e-6)
 
 
-def test_a_fitted_background_is_trained_and_goes_on_where_it_was(trainer):
+def test_a_fitted_background_is_trained_and_restored(trainer):
     images = [TrainingImage(image.name, image.camera, image.rgb, None) for image in trainer.images]
 
     def begun():
@@ -221,7 +221,7 @@ def test_a_fitted_background_is_trained_and_goes_on_where_it_was(trainer):
     assert torch.equal(one.shown_background(), other.shown_background())
 
 
-def test_primitives_are_blended_by_their_centres_until_the_last_part_of_the_run(trainer):
+def test_overlap_is_used_from_order_from_on(trainer):
     options = replace(trainer.options, order="overlap", order_from=0.7)
     parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
     late = Trainer(trainer.images, parameters, options, trainer.bounds, torch.ones(3), False, True)
@@ -231,8 +231,8 @@ def test_primitives_are_blended_by_their_centres_until_the_last_part_of_the_run(
 
 
 @pytest.mark.parametrize("drawn", [False, True])
-def test_what_stands_behind_masks_has_no_gain(trainer, drawn):
-    """Grey primitives, and two photographs of them, twice and half as bright: these fit over any background."""
+def test_gains_do_not_apply_to_the_background_of_masks(trainer, drawn):
+    """Two photographs show grey primitives twice and half as bright; with gains they fit over any background."""
     parameters = {name: value.detach().clone() for name, value in trainer.parameters.items()}
     parameters["sh_dc"][:] = (0.3 - 0.5) / SH_Y0
     grey = Trainer(trainer.images[:2], parameters, trainer.options, trainer.bounds, torch.ones(3), False, drawn)
@@ -255,7 +255,7 @@ def test_the_state_of_another_training_is_refused(trainer):
             trainer.restore(state | {name: fewer})
 
 
-def test_the_seconds_of_a_training_are_those_of_its_steps(trainer):
+def test_seconds_add_up_the_steps(trainer):
     begin = time.perf_counter()
     trainer.advance()
     one = trainer.seconds
@@ -263,7 +263,7 @@ def test_the_seconds_of_a_training_are_those_of_its_steps(trainer):
     assert 0 < one < trainer.seconds <= time.perf_counter() - begin
 
 
-def test_the_start_follows_the_points():
+def test_start_parameters_follow_from_points():
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
     rgb = np.array([[255, 0, 128]] * 5, dtype=np.uint8)
     start = initial_parameters(xyz, rgb, 2, 0, (1e-3, 0.9))
@@ -288,7 +288,7 @@ def test_the_start_follows_the_points():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_start_of_every_kind(kind):
+def test_start_size_and_opacity_of_every_kind(kind):
     xyz = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 1.5]])
     start = initial_parameters(xyz, np.zeros((5, 3), np.uint8), 0, 0, (1e-3, 9.0), kind)
     extent = np.exp(start["log_extent"].numpy())
@@ -299,7 +299,7 @@ def test_the_start_of_every_kind(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_3d_filter_widens_what_is_rendered(kind):
+def test_the_3d_filter_widens_rendered_primitives(kind):
     columns, raw = KINDS[kind].extents, torch.tensor([-2.0, 0.0, 3.0])
     parameters = {
         "center": torch.zeros(3, 3),
@@ -313,12 +313,12 @@ def test_the_3d_filter_widens_what_is_rendered(kind):
     _, _, extent, density, _ = activate(parameters, 0, kind, length)
     wider = torch.sqrt(0.04 + length**2) if kind == "gaussian" else 0.2 + length / 2
     assert torch.allclose(extent, wider[:, None].repeat(1, columns))
-    # Opacity refers to what is rendered.
+    # Opacity is that of the widened primitives.
     saved = Primitives(*(x.numpy() for x in activate(parameters, 0, kind, length)), kind)
     assert np.allclose(saved.alpha, torch.sigmoid(raw), rtol=1e-5)
 
 
-def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(trainer):
+def test_filter_lengths_follow_from_the_nearest_view_that_sees_a_primitive(trainer):
     cameras = [image.camera for image in trainer.images]
     rng = np.random.default_rng(0)
     center = rng.normal(size=(300, 3)) * 4
@@ -338,7 +338,7 @@ def test_the_length_of_the_3d_filter_is_that_of_the_nearest_view_that_sees(train
     assert 50 < seen < 300
 
 
-def test_the_3d_filter_is_made_again_for_where_primitives_have_moved(trainer, monkeypatch):
+def test_the_3d_filter_is_updated_after_a_number_of_steps(trainer, monkeypatch):
     monkeypatch.setattr("linprim_geo.training.step.trainer.FILTER_EVERY", 2)
     trainer.options = replace(trainer.options, filter="3d")
     trainer._refilter()
@@ -350,12 +350,12 @@ def test_the_3d_filter_is_made_again_for_where_primitives_have_moved(trainer, mo
     assert torch.equal(trainer.filter_3d, wanted) and not torch.equal(wanted, before)
 
 
-def test_the_exponential_is_rounded_once_and_is_its_own_gradient():
+def test_exponential_is_accurate_and_its_own_gradient():
     x = torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, 10_000).astype(np.float32)).requires_grad_()
     y = ops.exponential(x)
     exact = np.exp(x.detach().numpy().astype(np.longdouble))
     found = y.detach().numpy()
-    # Half a step of float32, and what float64 loses on the way: 20 roundings of an exponent of up to 20.
+    # Half a unit of float32, and float64 errors: 20 roundings with exponents of up to 20.
     assert y.dtype == torch.float32
     assert (np.abs(found - exact) <= (0.5 + 400 * 2.0**-29) * np.spacing(found)).all()
     (gradient,) = torch.autograd.grad(y.sum(), x)
