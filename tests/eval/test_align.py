@@ -1,4 +1,4 @@
-"""Meshes that lie elsewhere than their reference are brought to it, and what was done is said."""
+"""Alignment of meshes to their reference, and its report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL_TURN = Rotation.from_rotvec([0.05, -0.08, 0.06]).as_matrix()
 
 
 def shape() -> Mesh:
-    """A surface without symmetry: waves, and a thin wall on one side of them."""
+    """An asymmetric surface: waves, and a thin wall on one side."""
     wall = wavy()
     wall = replace(wall, vertices=wall.vertices @ np.diag([0.4, 0.5, 1.0]) @ rotation(3).T + [0.2, 0.7, 0.3])
     return join(wavy(), wall)
@@ -46,36 +46,36 @@ def moved(mesh: Mesh, matrix: np.ndarray) -> Mesh:
         ("similarity", 0.013, rotation(5), (700.0, -20.0, 3.0)),
     ],
 )
-def test_a_motion_is_found_and_undone(way, scale, turn, offset):
+def test_alignment_inverts_a_known_motion(way, scale, turn, offset):
     mesh, motion = shape(), matrix_of(scale, turn, offset)
     _, about = align(moved(mesh, motion), mesh, way)
-    # The same surface: nothing but rounding is left, of coordinates 700 / 0.013 of what is looked at.
+    # Surfaces are equal up to rounding of coordinates of 700, with a scale of 0.013.
     np.testing.assert_allclose(np.array(about["matrix"]) @ motion, np.eye(4), atol=1e-7)
     assert about["way"] == way and about["scale"] == pytest.approx(1 / scale)
     assert about["distance_after"] < 1e-7 < about["distance_before"]
 
 
-def test_what_one_side_alone_has_is_no_reason_to_move():
+def test_parts_missing_in_one_mesh_do_not_change_the_alignment():
     mesh, motion = shape(), matrix_of(1.0, SMALL_TURN, (0.02, 0.0, -0.03))
     part = select_faces(mesh, mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.15)
     _, about = align(moved(part, motion), mesh, "icp")
     np.testing.assert_allclose(np.array(about["matrix"]) @ motion, np.eye(4), atol=1e-6)
 
 
-def test_points_of_a_scan_are_a_reference_too():
+def test_alignment_to_points_of_a_scan():
     mesh, motion = shape(), matrix_of(1.1, SMALL_TURN, (0.02, 0.05, -0.03))
     points, _ = sample_surface(refine(mesh, 0.1), 100_000, 1)
     _, about = align(moved(mesh, motion), points, "similarity")
-    # Points are some 0.005 apart, and their mean over so many is far better than that.
+    # Points are about 0.005 apart; averaging over all of them is much more accurate.
     np.testing.assert_allclose(np.array(about["matrix"]) @ motion, np.eye(4), atol=1e-3)
 
 
-def test_what_lies_right_stays():
+def test_an_aligned_mesh_stays():
     _, about = align(shape(), shape(), "icp")
     np.testing.assert_allclose(about["matrix"], np.eye(4), atol=1e-9)
 
 
-def test_cameras_of_the_run_go_with_the_mesh(tmp_path):
+def test_cameras_of_the_run_are_transformed_with_the_mesh(tmp_path):
     mesh, motion = shape(), matrix_of(0.5, rotation(2), (3.0, 1.0, 2.0))
     save_mesh(tmp_path / "mesh.ply", moved(mesh, motion))
     save_mesh(tmp_path / "reference.ply", mesh)
@@ -88,12 +88,12 @@ def test_cameras_of_the_run_go_with_the_mesh(tmp_path):
         files = tmp_path / f"{name}.ply", tmp_path / "reference.ply"
         scores[name] = eval_mesh_files(*files, samples=2000, run=run, align=way)
     kept = [scores[name]["visible"]["kept_prediction"] for name in ("reference", "mesh")]
-    # The same samples but for rounding of the file's float32.
+    # Samples differ only by rounding to float32 in the file.
     assert 0.1 < kept[0] < 0.95 and kept[1] == pytest.approx(kept[0], abs=0.01)
     assert scores["mesh"]["chamfer"] < 1e-5
 
 
-def test_the_command_says_what_it_did(tmp_path, capsys):
+def test_the_command_reports_the_alignment(tmp_path, capsys):
     mesh = shape()
     save_mesh(tmp_path / "a.ply", moved(mesh, matrix_of(1.0, SMALL_TURN, (0.05, 0.0, 0.0))))
     save_mesh(tmp_path / "b.ply", mesh)

@@ -1,4 +1,4 @@
-"""What cameras see of sampled surfaces, against closed forms and float64 rays, and distances along their rays."""
+"""Culling of samples by cameras, compared with closed forms and float64 rays, and distances along rays."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ from linprim_geo.geometry.raycast import RayCaster
 ROUNDING = 1e-14
 
 
-def test_a_camera_sees_the_cap_of_a_sphere():
+def test_the_visible_share_of_a_sphere_agrees_with_the_closed_form():
     result = score_mesh(sphere(1.1, 5), sphere(1.0, 5), samples=40_000, cameras=[camera_above(3.0)])
     # A point is seen where its normal turns to the camera: cos > r / d, a cap of (1 - r / d) / 2 of the area.
     # The faceted outline is off by up to an edge, 0.06, of its circumference at the silhouette.
@@ -29,27 +29,27 @@ def test_a_camera_sees_the_cap_of_a_sphere():
     assert both["kept_prediction"] == pytest.approx(2 * result["visible"]["kept_prediction"], abs=0.002)
 
 
-def test_junk_behind_the_surface_counts_only_without_culling():
+def test_hidden_surfaces_count_only_without_culling():
     front, behind = grid(20, 10), grid(20, 10, height=-0.4)
     cameras = [camera_above(2.0, target=(1.0, 0.5))]
     result = score_mesh(join(front, behind), front, samples=4000, cameras=cameras)
     assert result["accuracy"] == pytest.approx(0.2, abs=1e-3) and result["precision"] == pytest.approx(0.5, abs=1e-3)
     visible = result["visible"]
     assert visible["accuracy"] < ROUNDING and visible["precision"] == 1.0 and visible["f1"] == 1.0
-    # Seen from 2 above, the junk 0.4 lower peeps out nowhere: the upper sheet hides 1.2 times its own size.
+    # Seen from a height of 2, the upper sheet hides 1.2 times its size at the lower one, 0.4 below it.
     assert visible["kept_prediction"] == pytest.approx(0.5, abs=1e-3) and visible["kept_reference"] == 1.0
     assert SCORES <= set(visible)
     assert {"chamfer_percent_diagonal", "standard_error_percent_diagonal"} <= set(visible)
 
 
-def test_only_what_falls_into_the_image_is_kept():
+def test_samples_outside_of_images_are_culled():
     # The image shows x in [0, 1] of the [0, 2] x [0, 1] rectangle: half of it.
     camera = camera_above(1.0, focal=200.0, target=(0.5, 0.5))
     result = score_mesh(grid(height=0.0), grid(), samples=8000, cameras=[camera])
     assert result["visible"]["kept_reference"] == pytest.approx(0.5, abs=2e-3)
 
 
-def test_cameras_that_see_nothing_give_no_scores_but_the_rest_stands():
+def test_cameras_that_see_nothing_give_nan_for_visible_scores_only():
     away = [camera_above(-1.0)]  # looks down from below
     result = score_mesh(grid(height=0.1), grid(), samples=500, cameras=away)
     assert result["visible"]["kept_prediction"] == 0.0 and math.isnan(result["visible"]["chamfer"])
@@ -59,7 +59,7 @@ def test_cameras_that_see_nothing_give_no_scores_but_the_rest_stands():
     assert "visible" not in score_mesh(grid(), grid(), samples=500)
 
 
-def test_culling_by_embree_is_that_of_float64_rays():
+def test_culling_by_embree_agrees_with_float64_rays():
     import igl
 
     # Two crossing spheres and a wall: much is hidden, by others and by itself.
@@ -88,7 +88,7 @@ def test_culling_by_embree_is_that_of_float64_rays():
 # --- along the rays of the cameras ---------------------------------------------------------------------------
 
 
-def test_along_rays_an_offset_plane_is_further_by_the_slant():
+def test_ray_distances_of_an_offset_plane_agree_with_the_closed_form():
     camera = camera_above(3.0, target=(1.0, 0.5))
     # 200 x 200 pixels at focal length 100 see 6 x 6 around the target, which both planes fill.
     plane = replace(grid(5, 5), vertices=8 * grid(5, 5, (1.0, 1.0)).vertices - [3, 3.5, 0])
@@ -105,7 +105,7 @@ def test_along_rays_an_offset_plane_is_further_by_the_slant():
     assert swapped["distance_mean"] == pytest.approx(result["distance_mean"], abs=4 * swapped["standard_error"])
 
 
-def test_misses_and_phantoms_are_shares_of_the_rays_that_could():
+def test_misses_and_phantoms_are_shares_of_possible_rays():
     left, right = grid(3, 3, size=(1.0, 1.0)), grid(3, 3, size=(1.0, 1.0))
     right = replace(right, vertices=right.vertices + [0.5, 0.0, 0.0])
     # The image shows [-0.5, 1.5] x [-0.5, 1.5]: 1/4 is left, half of it shared with right.
@@ -119,7 +119,7 @@ def test_misses_and_phantoms_are_shares_of_the_rays_that_could():
     assert nobody["rays"] == 0 and math.isnan(nobody["miss"])
 
 
-def test_rays_into_edges_and_vertices_are_caught():
+def test_rays_through_edges_and_vertices_hit():
     # Pixel centres that fall onto the vertices, edges and diagonals of the plane, 1e6 away from the origin.
     away = np.array([1e6, -2e6, 5e5])
     plane = grid(16, 16, size=(2.0, 2.0))

@@ -44,7 +44,7 @@ def test_deltas_are_symmetric_in_the_ratio_and_strict():
 
 
 @pytest.mark.parametrize("nothing", [0.0, -1.0, np.nan, np.inf])
-def test_pixels_without_a_surface_count_for_coverage_and_phantoms_only(nothing):
+def test_pixels_without_depth_count_for_coverage_and_phantom_only(nothing):
     predicted, reference = REFERENCE + 0.5, REFERENCE.copy()
     predicted[0] = nothing  # 10 missed pixels
     reference[1:3] = nothing  # 20 pixels of background
@@ -56,7 +56,7 @@ def test_pixels_without_a_surface_count_for_coverage_and_phantoms_only(nothing):
     assert scores["mae"] == pytest.approx(0.5) and scores["rmse"] == pytest.approx(0.5)
 
 
-def test_nothing_in_common_scores_nan():
+def test_depths_without_common_pixels_score_nan():
     scores = score_depth(np.zeros((4, 4)), np.ones((4, 4)))
     assert scores["coverage"] == 0.0 and scores["pixels"] == 0 and math.isnan(scores["mae"])
     assert math.isnan(score_depth(np.ones((4, 4)), np.zeros((4, 4)))["coverage"])
@@ -65,7 +65,7 @@ def test_nothing_in_common_scores_nan():
 
 
 def rotated(angle_deg, shape):
-    """Normals along z, and the same turned by `angle_deg` (an array of `shape`) about x."""
+    """Normals along z, and the same rotated about x by `angle_deg` (an array of `shape`)."""
     angle = np.radians(np.broadcast_to(angle_deg, shape))
     return np.stack([0 * angle, np.sin(angle), np.cos(angle)], -1), np.broadcast_to([0.0, 0.0, 1.0], (*shape, 3))
 
@@ -127,7 +127,7 @@ class FakeView:
 
 @dataclass
 class FakeRun:
-    """A run that sees the plane z = `height`, from above, exactly."""
+    """A run that renders the plane z = `height` exactly."""
 
     path: object
     test: tuple
@@ -157,7 +157,7 @@ class FakeRun:
 
 
 def look_down(height, tilt_deg=0.0, target=(0.0, 0.0)):
-    """A camera at `height` above `target`, turned from straight down by `tilt_deg`."""
+    """A camera at `height` above `target` that looks down, tilted by `tilt_deg`."""
     angle = np.radians(tilt_deg)
     turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
     pose = np.eye(4)
@@ -175,7 +175,7 @@ def two_views(**fields):
     return (FakeView("a", look_down(3.0), **fields), FakeView("b", look_down(4.0, 20.0), **fields))
 
 
-def test_run_against_a_mesh_at_the_rendered_place(tmp_path):
+def test_a_run_has_no_error_against_its_own_surface(tmp_path):
     save_mesh(tmp_path / "reference.ply", square())
     run = FakeRun(tmp_path, two_views(), height=0.0)
     result = eval_depth_run(run, tmp_path / "reference.ply")
@@ -190,14 +190,14 @@ def test_run_against_a_mesh_at_the_rendered_place(tmp_path):
     assert [row["name"] for row in rows] == ["a", "b"] and rows[0]["coverage"] == "1.0"
 
 
-def test_the_run_s_own_order_of_blending_is_scored_on_request(tmp_path):
+def test_other_depths_are_scored_on_request(tmp_path):
     run = FakeRun(tmp_path, two_views(), height=0.0)
     for depth, wanted in (("depth_overlap", 0.0), ("depth_median", 0.2), ("depth_expected", 0.1)):
         result = eval_depth_run(run, square(), depth=depth)
         assert result["depth"] == depth and result["abs_rel"] == pytest.approx(wanted, abs=1e-6)
 
 
-def test_run_against_a_mesh_behind_the_rendered_surface(tmp_path):
+def test_errors_against_a_shifted_mesh_agree_with_the_closed_form(tmp_path):
     offset, reference = 0.25, square(-0.25)
     result = eval_depth_run(FakeRun(tmp_path, two_views(), height=0.0), reference, output=tmp_path / "out")
     # Depth errors of a plane moved along z by h: h over the z component of the ray with camera z = 1.
@@ -212,12 +212,12 @@ def test_run_against_a_mesh_behind_the_rendered_surface(tmp_path):
     assert (tmp_path / "out" / "results.json").is_file() and not (tmp_path / "eval").exists()
 
 
-def test_run_scores_another_depth_when_asked(tmp_path):
+def test_expected_depth_is_scored_on_request(tmp_path):
     run = FakeRun(tmp_path, two_views(), height=0.0)
     assert eval_depth_run(run, square(), depth="depth_expected")["abs_rel"] == pytest.approx(0.1, abs=1e-9)
 
 
-def test_reference_seen_by_a_part_of_the_pixels(tmp_path):
+def test_reference_visible_in_a_part_of_the_image(tmp_path):
     view = FakeView("a", look_down(3.0, target=(0.0, 0.0)))
     right = square().vertices * [0.5, 1, 1] + [10.0, 0, 0]  # x > 0 only: the pixels right of cx = 12.3
     result = eval_depth_run(FakeRun(tmp_path, (view,), height=0.0), replace(square(), vertices=right))

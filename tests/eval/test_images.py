@@ -19,7 +19,7 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def ssim_direct(a, b):
-    """The definition, pixel by pixel and window by window: no separability, no running moments."""
+    """Evaluate the definition for every window, without separable filters or running moments."""
     offsets = np.arange(-5, 6)
     window = np.exp(-(offsets[:, None] ** 2 + offsets[None, :] ** 2) / (2 * 1.5**2))
     window /= window.sum()
@@ -38,7 +38,7 @@ def ssim_direct(a, b):
 
 
 @pytest.mark.parametrize("shape", [(23, 17, 3), (11, 11, 1), (4, 30, 3), (1, 1, 3)])
-def test_ssim_equals_its_definition(shape):
+def test_ssim_agrees_with_its_definition(shape):
     random = np.random.default_rng(1)
     a = random.random(shape)
     b = np.clip(a + 0.2 * random.standard_normal(shape), 0, 1)
@@ -88,7 +88,7 @@ def test_psnr_averages_squares_over_pixels_and_channels():
 
 
 @pytest.mark.parametrize("score", [psnr, ssim])
-def test_images_that_cannot_be_compared_are_refused(score):
+def test_incompatible_images_are_refused(score):
     good = np.zeros((12, 12, 3))
     with pytest.raises(ValueError, match="shapes"):
         score(good, np.zeros((12, 13, 3)))
@@ -107,7 +107,7 @@ def test_rounding_to_8_bits_is_within_half_a_step_and_clamps():
     assert (to_8bit(np.arange(256) / 255.0) == np.arange(256)).all()
 
 
-def test_means_over_pairs():
+def test_score_images_averages_over_pairs():
     a = np.zeros((12, 12, 3))
     result = score_images([(a, a + 0.1), (a, a + 0.01)])
     assert result["psnr"] == pytest.approx((20 + 40) / 2)

@@ -1,5 +1,4 @@
-"""LPIPS: the closed forms of constructed weights, the definition restated, weights of all layouts, and files that are
-none."""
+"""LPIPS: closed forms for constructed weights, the definition, layouts of weight files, and invalid files."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ def heads(network, seed=1):
 
 @pytest.fixture(autouse=True)
 def nothing_at_hand(monkeypatch, tmp_path):
-    """No weights but those that a test makes."""
+    """Hide all weights except those that a test makes."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
 
@@ -104,8 +103,8 @@ def layers_of(network):
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("as_3dgs", [False, True])
-def test_it_is_the_distance_of_the_definition(network, as_3dgs, both):
-    """In float64, by torch's modules, with the sum over channels and the mean over pixels written out."""
+def test_distance_agrees_with_the_definition(network, as_3dgs, both):
+    """The definition in float64 with torch modules."""
     modules, compared = layers_of(network)
     stack = torch.nn.ModuleList(modules).double()
     stack.load_state_dict({key.removeprefix("features."): value for key, value in backbone(network).items()})
@@ -131,7 +130,7 @@ def test_it_is_the_distance_of_the_definition(network, as_3dgs, both):
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_equal_images_are_0_apart_and_it_is_symmetric(network, both):
+def test_distance_is_zero_for_equal_images_and_symmetric(network, both):
     a, b = images(40, 35)
     each = both[network]
     assert each.distance(a, a) == 0
@@ -140,9 +139,8 @@ def test_equal_images_are_0_apart_and_it_is_symmetric(network, both):
     assert each.distance(rounded, b) == pytest.approx(each.distance(rounded.astype(np.float32) / 255, b), rel=1e-6)
 
 
-def test_constructed_weights_have_the_value_of_the_closed_form():
-    """Only the first layer is compared, and its first two channels are red and 1: one image's feature is (r, 1) / |(r,
-    1)|."""
+def test_constructed_weights_agree_with_the_closed_form():
+    """Only the first layer is compared. Its first two channels are red and 1, so features are (r, 1) / |(r, 1)|."""
     network = NETWORKS["vgg"]
     weights = {name: torch.zeros(shape) for name, shape in network.shapes().items()}
     for index in ("0", "2"):
@@ -161,7 +159,7 @@ def test_constructed_weights_have_the_value_of_the_closed_form():
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_what_is_too_small_is_refused(network, both):
+def test_small_images_are_refused(network, both):
     least = SMALLEST[network]
     a, b = images(least, least)
     assert both[network].distance(a, b) > 0
@@ -176,8 +174,8 @@ def test_what_is_too_small_is_refused(network, both):
 # --- weights ---------------------------------------------------------------------------------------------
 
 
-def test_one_file_of_the_whole_package_is_enough(tmp_path, both):
-    """Slices keep torchvision's numbers, and the heads are there twice."""
+def test_weights_in_one_file_are_accepted(tmp_path, both):
+    """The package keeps torchvision's layer numbers in slices and stores the heads twice."""
     state = {}
     for key, value in backbone("alex").items():
         index, what = key.removeprefix("features.").split(".")
@@ -191,7 +189,7 @@ def test_one_file_of_the_whole_package_is_enough(tmp_path, both):
     assert found.files == [str(tmp_path / "whole.pt")]
 
 
-def test_torchs_cache_and_installed_packages_are_looked_at(tmp_path, monkeypatch, files, both):
+def test_weights_are_found_in_the_torch_cache_and_packages(tmp_path, monkeypatch, files, both):
     assert find_lpips()[0] == []
     cache = tmp_path / "torch" / "hub" / "checkpoints"
     cache.mkdir(parents=True)
@@ -267,7 +265,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_files_that_are_no_weights_are_refused_in_a_sentence(kind, files, tmp_path):
+def test_files_without_weights_are_refused(kind, files, tmp_path):
     path = tmp_path / "weights.pth"
     damaged(kind, files, path)
     with pytest.raises(LinprimError) as refused:
@@ -279,7 +277,7 @@ def test_files_that_are_no_weights_are_refused_in_a_sentence(kind, files, tmp_pa
     )
 
 
-def test_places_without_enough_are_refused_in_a_sentence(files, tmp_path):
+def test_incomplete_weights_are_refused(files, tmp_path):
     with pytest.raises(LinprimError, match="no such file or folder, wanted the weights of LPIPS"):
         find_lpips(tmp_path / "gone.pth")
     with pytest.raises(LinprimError, match="holds no .pth and no .pt file"):
@@ -297,7 +295,7 @@ def test_places_without_enough_are_refused_in_a_sentence(files, tmp_path):
 # --- the command -----------------------------------------------------------------------------------------
 
 
-def test_the_command_scores_with_weights_and_says_so_without(tiny_run, files, tmp_path, capfd):
+def test_the_command_scores_with_weights_and_reports_missing_ones(tiny_run, files, tmp_path, capfd):
     def command(*more, status=0):
         assert cli.main(["eval-images", str(tiny_run), "-o", str(tmp_path / "out"), "--json", *more]) == status
         shown = capfd.readouterr()
@@ -325,7 +323,7 @@ def test_the_command_scores_with_weights_and_says_so_without(tiny_run, files, tm
     assert "gone.pth: no such file or folder" in command("--lpips-weights", str(tmp_path / "gone.pth"), status=1)
 
 
-def test_views_that_are_too_small_are_named(files, tmp_path):
+def test_networks_skip_or_refuse_small_views(files, tmp_path):
     from linprim_geo.base.options import SceneOptions, TrainOptions
     from linprim_geo.synthetic.synth import synthesize
     from linprim_geo.training.train import train

@@ -1,4 +1,4 @@
-"""A mesh as a run's cameras see it: what covers a pixel in part, what is behind it, and its scores."""
+"""Renders of a mesh by a run's cameras: partly covered pixels, background, and scores."""
 
 import json
 from types import SimpleNamespace
@@ -27,8 +27,7 @@ def run_of(environment=None):
 
 @pytest.fixture
 def wall(tmp_path):
-    """Two squares side by side at depth 2: from column 1 and a third to 4 one, to column 6 the other, and rows 1 to
-    5."""
+    """Two adjacent rectangles at depth 2, in rows 1 to 5: from column 1 1/3 to 4, and from 4 to 6."""
 
     def square(left, right):
         corners = np.array([(left, 1), (right, 1), (right, 5), (left, 5)], float)
@@ -42,13 +41,13 @@ def wall(tmp_path):
 
 
 @pytest.mark.parametrize("rays", [1 << 20, 1])
-def test_pixels_are_means_over_what_covers_them(wall, rays, monkeypatch):
+def test_pixels_average_over_supersampled_rays(wall, rays, monkeypatch):
     monkeypatch.setattr(mesh_images, "RAYS_AT_ONCE", rays)
     ((view, images),) = render_mesh(run_of(), [VIEW], wall)
     assert view is VIEW and images["rgb"].dtype == images["opacity"].dtype == np.float32
     covered = np.zeros((6, 8))
     covered[1:5, 1:6] = 1
-    # Two of the three columns of rays in it.
+    # Two of three columns of rays hit this pixel.
     covered[1:5, 1] = 2 / 3
     assert images["opacity"] == pytest.approx(covered, abs=1e-6)
     wanted = np.zeros((6, 8, 3))
@@ -57,7 +56,7 @@ def test_pixels_are_means_over_what_covers_them(wall, rays, monkeypatch):
     assert np.moveaxis(images["rgb"], 0, -1) == pytest.approx(wanted, abs=1e-5)
 
 
-def test_an_environment_is_seen_past_the_mesh(wall):
+def test_the_environment_is_rendered_behind_the_mesh(wall):
     environment = torch.full((6, 4, 4, 3), 0.5)
     ((_, images),) = render_mesh(run_of(environment), [VIEW], wall)
     assert images["rgb"][:, 0, 0] == pytest.approx([0.5] * 3)
@@ -72,8 +71,8 @@ def test_a_mesh_without_colours_is_refused(wall, tmp_path):
         list(render_mesh(run_of(), [VIEW], tmp_path / "none.ply"))
 
 
-def test_a_mesh_is_scored_in_place_of_the_primitives(wall, tmp_path):
-    """Against its own render the mesh has no error."""
+def test_a_mesh_can_be_scored_instead_of_primitives(wall, tmp_path):
+    """The photograph is a render of the mesh, so its error is zero."""
     run = run_of()
     ((_, images),) = render_mesh(run, [VIEW], wall)
     photo = to_8bit(np.moveaxis(images["rgb"], 0, -1))

@@ -1,4 +1,4 @@
-"""The headline protocol against closed forms, an exhaustive search, and meshes that break libraries."""
+"""The headline protocol: closed forms, an exhaustive search, and difficult meshes."""
 
 import json
 import math
@@ -26,7 +26,7 @@ def scores_only(results):
 
 
 def assert_same_scores(a, b, errors=4.0):
-    """Equal but for the sampling: within some standard errors of both."""
+    """Scores are equal within some of their standard errors."""
     allowed = errors * math.hypot(a["standard_error"], b["standard_error"]) + ROUNDING
     assert abs(a["chamfer"] - b["chamfer"]) <= allowed
 
@@ -35,7 +35,7 @@ def assert_same_scores(a, b, errors=4.0):
 
 
 @pytest.mark.parametrize("radius", [1.2, 0.7])
-def test_concentric_spheres_are_apart_by_the_difference_of_their_radii(radius):
+def test_distance_of_concentric_spheres_is_the_difference_of_radii(radius):
     prediction, reference = sphere(radius, 5), sphere(1.0, 5)
     slack = max(radius - inradius(prediction), 1.0 - inradius(reference))
     assert slack < 1.5e-3
@@ -49,7 +49,7 @@ def test_concentric_spheres_are_apart_by_the_difference_of_their_radii(radius):
 
 
 @pytest.mark.parametrize("offset", [1e-6, 0.01, 3.0])
-def test_an_offset_plane_is_its_offset_away_however_it_is_triangulated(offset):
+def test_distance_of_an_offset_plane_is_exact_for_any_triangulation(offset):
     reference = grid(3, 5)
     for prediction in (
         grid(1, 1, height=offset),
@@ -100,7 +100,7 @@ def test_a_tilted_plane_gives_the_angle_and_the_quantiles_of_a_ramp():
     assert result["normal_consistency"] == pytest.approx(1 / math.hypot(1, slope), abs=1e-12)
 
 
-def test_the_same_surface_has_no_floor_where_point_to_point_distances_have_one():
+def test_equal_surfaces_have_distance_zero_unlike_point_sets():
     import igl
     from scipy.spatial import cKDTree
 
@@ -115,7 +115,7 @@ def test_the_same_surface_has_no_floor_where_point_to_point_distances_have_one()
 # --- triangulation, sampling, frames ------------------------------------------------------------------------
 
 
-def test_distances_do_not_depend_on_the_triangulation_at_all():
+def test_distances_do_not_depend_on_the_triangulation():
     mesh = wavy()
     points = np.random.default_rng(0).uniform([-0.5, -0.5, -0.5], [2.5, 1.5, 0.5], (4000, 3))
     coarse, _ = SurfaceDistance(mesh).query(points)
@@ -156,7 +156,7 @@ def test_samples_are_uniform_by_area():
             assert moment.mean() == pytest.approx(expected, abs=allowed)
 
 
-def test_distances_equal_an_exhaustive_search():
+def test_distances_agree_with_an_exhaustive_search():
     random = np.random.default_rng(3)
     mesh = Mesh(random.standard_normal((60, 3)), np.array([random.choice(60, 3, replace=False) for _ in range(80)]))
     points = 2 * random.standard_normal((300, 3))
@@ -167,7 +167,7 @@ def test_distances_equal_an_exhaustive_search():
 
 
 def distance_to_triangle(points, corners):
-    """To the nearest of the plane's foot point, where it is inside, and the three edges."""
+    """Distance to the foot point on the plane, if it is inside, or to the nearest edge."""
     best = np.full(len(points), np.inf)
     for k in range(3):
         start, edge = corners[k], corners[(k + 1) % 3] - corners[k]
@@ -180,7 +180,7 @@ def distance_to_triangle(points, corners):
     return np.where((b >= 0) & (c >= 0) & (b + c <= 1), np.minimum(best, height), best)
 
 
-def test_equal_seeds_give_equal_scores_and_others_do_not():
+def test_scores_are_reproducible_for_equal_seeds():
     prediction, reference = wavy(), grid()
     first, again, other = (score_mesh(prediction, reference, samples=3000, seed=seed) for seed in (1, 1, 2))
     assert repr(scores_only(first)) == repr(scores_only(again))  # NaN is not equal to itself
@@ -191,7 +191,7 @@ def test_equal_seeds_give_equal_scores_and_others_do_not():
 @pytest.mark.parametrize(
     "pair", [(wavy(), grid()), (grid(1, 1, size=(1.0, 1.0)), grid(1, 1))], ids=["fine", "two faces"]
 )
-def test_the_standard_error_is_the_spread_over_seeds_or_a_little_more(pair):
+def test_the_standard_error_agrees_with_the_spread_over_seeds(pair):
     results = [score_mesh(*pair, samples=400, seed=seed) for seed in range(60)]
     spread = np.std([result["chamfer"] for result in results], ddof=1)
     stated = np.mean([result["standard_error"] for result in results])
@@ -200,7 +200,7 @@ def test_the_standard_error_is_the_spread_over_seeds_or_a_little_more(pair):
     assert 0.75 < stated / spread < 2.5
 
 
-def test_scores_move_with_the_meshes_and_scale_with_them():
+def test_scores_are_invariant_to_motion_and_scale_with_size():
     prediction, reference = wavy(), grid()
     original = score_mesh(prediction, reference, samples=5000)
     factor = 4.0
@@ -217,7 +217,7 @@ def test_scores_move_with_the_meshes_and_scale_with_them():
     assert result["normal_consistency"] == pytest.approx(original["normal_consistency"], abs=2e-3)
 
 
-def test_a_million_units_away_from_the_origin_nothing_changes():
+def test_scores_do_not_depend_on_the_distance_from_the_origin():
     away = np.array([1e6, -2e6, 3e6])
     pair = sphere(1.1, 4), sphere(1.0, 4)
     near = score_mesh(*pair, samples=3000)
@@ -230,7 +230,7 @@ def test_a_million_units_away_from_the_origin_nothing_changes():
     assert apart["chamfer"] == pytest.approx(1e6, abs=2.5) and apart["f1"] == 0.0
 
 
-def test_orientation_shows_in_the_signed_normal_consistency_only():
+def test_only_signed_normal_consistency_depends_on_orientation():
     mesh = sphere(1.0, 2)
     inside_out = replace(mesh, faces=mesh.faces[:, ::-1])
     result = score_mesh(inside_out, mesh, samples=500)
@@ -254,7 +254,7 @@ def test_morton_order_is_a_permutation_that_keeps_neighbours_together():
 # --- meshes that break libraries ----------------------------------------------------------------------------
 
 
-def test_one_triangle_against_one_triangle():
+def test_single_triangles_are_scored():
     lower = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     result = score_mesh(replace(lower, vertices=lower.vertices + [0, 0, 0.3]), lower, samples=50)
     assert result["chamfer"] == pytest.approx(0.3, abs=ROUNDING) and result["samples"] == 50
@@ -293,7 +293,7 @@ def test_non_manifold_and_self_intersecting_meshes_are_scored():
 
 
 @pytest.mark.parametrize("aspect", [1e2, 1e3, 1e4, 1e5])
-def test_a_needle_alone_is_right_to_the_stated_bound(aspect):
+def test_distances_to_a_needle_are_within_the_bound(aspect):
     needle = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [1, 1 / aspect, 0]]), np.array([[0, 1, 2]]))
     points, _ = sample_surface(needle, 500, 0)
     distance, _ = SurfaceDistance(needle).query(points + [0, 0, 0.01])
@@ -301,7 +301,7 @@ def test_a_needle_alone_is_right_to_the_stated_bound(aspect):
 
 
 @pytest.mark.parametrize("width", [1e-3, 1e-6, 1e-9])
-def test_a_needle_between_ordinary_triangles_does_no_harm(width):
+def test_needles_between_other_triangles_are_harmless(width):
     left, right = grid(1, 1, size=(1.0, 1.0)), grid(1, 1, size=(1.0, 1.0))
     needles = Mesh(
         np.array([[1, 0, 0], [1 + width, 0, 0], [1 + width, 1, 0], [1, 1, 0]]),
@@ -333,15 +333,15 @@ def test_options_out_of_range_are_refused(options):
         score_mesh(grid(), grid(), **options)
 
 
-def test_a_box_leaves_what_lies_in_it(tmp_path):
-    """A rectangle that is right up to x = 1 and 0.25 too high from there on."""
+def test_box_restricts_scores_to_its_inside(tmp_path):
+    """A rectangle that is exact up to x = 1 and 0.25 too high beyond."""
     low, high = grid(4, 4, size=(1.0, 1.0)), grid(4, 4, size=(1.0, 1.0), height=0.25)
     save_mesh(tmp_path / "a.ply", join(low, replace(high, vertices=high.vertices + [1, 0, 0])))
     save_mesh(tmp_path / "b.ply", grid(8, 4))
     files = tmp_path / "a.ply", tmp_path / "b.ply"
     assert eval_mesh_files(*files, samples=2000)["chamfer"] > 0.1
     result = eval_mesh_files(*files, samples=2000, box="0,0,-1,0.75,1,1")
-    # All of the box is at least as far from the step as the step is high.
+    # The box ends 0.25 before the step, whose height is 0.25.
     assert result["chamfer"] <= result["hausdorff"] < ROUNDING and "box" in result["culling"]
     assert result["kept_prediction"] == pytest.approx(0.375, abs=0.01) == result["kept_reference"]
     cameras = [camera_above(3.0, target=(x, 0.5)) for x in (0.4, 0.6)]
@@ -377,7 +377,7 @@ def test_files_are_scored_and_error_colours_written(tmp_path):
     assert flat.quality == pytest.approx(0.125, abs=1e-6)
 
 
-def test_without_an_output_nothing_is_written_and_a_run_gives_cameras_unit_and_folder(tmp_path):
+def test_files_are_written_only_with_an_output_or_a_run(tmp_path):
     save_mesh(tmp_path / "a.ply", grid(height=0.5))
     assert "visible" not in eval_mesh_files(tmp_path / "a.ply", tmp_path / "a.ply", samples=100)
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
@@ -416,7 +416,7 @@ def test_refinement_keeps_the_surface_and_its_orientation():
     assert len(refine(mesh, 1e-6, max_faces=5000).faces) <= 5000
 
 
-def test_error_colours_grow_lighter_evenly():
+def test_lightness_of_error_colours_is_linear():
     colors = error_colors(np.linspace(0, 1, 101)) / 255.0
     linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     luminance = linear @ [0.2126, 0.7152, 0.0722]

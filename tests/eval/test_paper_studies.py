@@ -1,5 +1,4 @@
-"""The paper's tables of single changes: what each study changes, known figures by class, and a quick run of all
-tables."""
+"""The paper's ablation tables: settings of each study, scores by class, and a quick run of all tables."""
 
 from __future__ import annotations
 
@@ -23,14 +22,14 @@ from linprim_geo.runs.run import Run
 
 @pytest.fixture(autouse=True)
 def points_as_they_are(monkeypatch):
-    """Looking for more points takes seconds for every training."""
+    """Do not add start points, which takes seconds for every training."""
     monkeypatch.setattr("linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points)
 
 
 # --- classes ---------------------------------------------------------------------------------------------
 
 
-def test_the_classes_add_up_to_the_image(tiny_run, tmp_path):
+def test_class_errors_agree_with_errors_per_pixel(tiny_run, tmp_path):
     run = Run.open(tiny_run)
     views = run.scene().test
     rng = np.random.default_rng(1)
@@ -54,7 +53,7 @@ def test_the_classes_add_up_to_the_image(tiny_run, tmp_path):
         assert pixels == len(of_class) and total == pytest.approx(of_class.sum())
 
 
-def test_labels_that_do_not_fit_are_refused_in_a_sentence(tiny_scene, tmp_path):
+def test_invalid_labels_are_refused(tiny_scene, tmp_path):
     view = load_scene(tiny_scene).test[0]
     target = tmp_path / f"{Path(view.name).stem}.png"
     with pytest.raises(
@@ -80,7 +79,7 @@ def test_labels_that_do_not_fit_are_refused_in_a_sentence(tiny_scene, tmp_path):
     assert np.array_equal(read_labels(tmp_path, half), wide[::2, ::2])
 
 
-def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
+def test_labels_of_built_in_scenes_are_their_parts(tiny_scene, tmp_path):
     from linprim_geo.synthetic.built_in import SHAPES
 
     views = load_scene(tiny_scene).test
@@ -98,7 +97,7 @@ def test_the_labels_of_a_built_in_scene_are_its_parts(tiny_scene, tmp_path):
 # --- published figures -----------------------------------------------------------------------------------
 
 
-def test_published_figures_are_those_of_the_authors_and_marked_as_such():
+def test_published_figures_are_consistent_and_marked():
     assert all(row["source"] == "published" for row in PUBLISHED)
     assert {row["table"] for row in PUBLISHED} == {"1", "2", "3", "4", "6", "7", "8", "9", "10", "12"}
     for row in published("3"):  # three of their numbers say one thing
@@ -111,7 +110,7 @@ def test_published_figures_are_those_of_the_authors_and_marked_as_such():
     assert published("rays") == []
 
 
-def test_numbers_of_a_table():
+def test_numbers_are_formatted_for_tables():
     assert [number(1.234, 2), number(1.234, 1, True), number(-0.5, 2, True), number(None, 2), number(math.nan, 2)] == [
         "1.23",
         "+1.2",
@@ -148,7 +147,7 @@ MADE = {
 
 
 @pytest.mark.parametrize("name", paper_tables.TABLES)
-def test_a_quick_run_makes_the_table(name, quick):
+def test_a_quick_run_writes_each_table(name, quick):
     table = json.loads((quick / f"table_{name}.json").read_text())
     text = (quick / f"table_{name}.txt").read_text()
     ours = [row for row in table["rows"] if row["source"] == "here"]
@@ -159,7 +158,7 @@ def test_a_quick_run_makes_the_table(name, quick):
         assert row["method"] in text
     assert ("published" in text) == (name != "rays") and paper_tables.TABLES[name].title in text
     assert len([row for row in table["rows"] if row["source"] == "published"]) == len(published(name))
-    # What a study changes makes a difference.
+    # Settings of a study change the results.
     assert len({tuple(row[column] for column in columns[:2]) for row in ours}) > 1
 
 
@@ -183,7 +182,7 @@ def test_tables_share_models_and_a_second_run_trains_nothing(quick, capsys):
         paper_tables.main([*command, "--tables", "3", "--labels", "x"])
 
 
-def test_a_capture_without_truth_is_left_out_and_named(quick, tmp_path, capsys):
+def test_captures_without_ground_truth_are_left_out_and_reported(quick, tmp_path, capsys):
     from linprim_geo.synthetic.synth import synthesize
 
     synthesize(tmp_path / "bare", shape="cad", views=6, test_views=2, size=32, points=200, supersample=1)

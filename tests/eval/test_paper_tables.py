@@ -1,4 +1,4 @@
-"""The tables of kinds against each other: interpolation with known answers, counts against brute force, a tiny run."""
+"""Tables that compare kinds of primitives: interpolation, counts against brute force, and a tiny run."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def power_law(counts, offset=0.0, factor=1.0):
     return [(n, 20 + offset + 5 * math.log10(n / 1000), factor * n**0.8 / 100, factor * n**0.8 / 200) for n in counts]
 
 
-def test_what_costs_more_without_scoring_more_is_no_part_of_a_curve():
+def test_rising_drops_points_that_cost_more_without_scoring_more():
     assert equal_points.rising([(4, 22.0), (1, 20.0), (3, 21.0), (2, 21.0), (5, 21.9)]) == [
         (1, 20.0),
         (2, 21.0),
@@ -49,7 +49,7 @@ def test_a_power_law_is_interpolated_exactly_between_any_points():
     for count in (1000, 1001, 2500, 3000, 19_000, 20_000):
         ((_, level, *wanted),) = power_law([count])
         assert equal_points.at_psnr(curve, level) == pytest.approx((count, *wanted), rel=1e-12)
-    # A larger model that scores less does not bend it.
+    # A larger model with a lower score does not change the curve.
     assert equal_points.at_psnr([*curve, (25_000, 21.0, 99.0, 99.0)], 22.0)[0] == pytest.approx(1000 * 10**0.4)
 
 
@@ -59,7 +59,7 @@ def test_nothing_is_extrapolated():
     assert equal_points.equal_psnr(curve, power_law([1000, 2000], offset=2.0)) == []
 
 
-def test_frame_times_are_compared_where_the_psnr_is_the_same():
+def test_frame_times_are_compared_at_equal_psnr():
     # B needs 10^(1 / 5) times fewer primitives for the same PSNR and three times longer for each of them.
     found = equal_points.equal_psnr(power_law([1000, 4000, 9000]), power_law([900, 8000], offset=1.0, factor=3.0))
     both = 21 + 5 * math.log10(0.9), 20 + 5 * math.log10(9)
@@ -70,7 +70,7 @@ def test_frame_times_are_compared_where_the_psnr_is_the_same():
         assert point["ms"][0] / point["core_ms"][0] == pytest.approx(2)
 
 
-def test_psnr_after_a_time_is_linear_in_its_logarithm_and_stays_after_the_end():
+def test_psnr_is_interpolated_in_log_time_and_constant_after_the_end():
     curve = [(t, 20 + 3 * math.log(t)) for t in (1.0, 4.0, 30.0)]
     for seconds in (1.0, 2.0, 4.0, 29.0):
         assert equal_points.at_time(curve, seconds) == pytest.approx(20 + 3 * math.log(seconds))
@@ -79,7 +79,7 @@ def test_psnr_after_a_time_is_linear_in_its_logarithm_and_stays_after_the_end():
     assert equal_points.at_time([*curve, (40.0, 3.0)], 40.0) == pytest.approx(curve[-1][1])
 
 
-def test_a_comparison_of_made_up_models():
+def test_comparison_of_synthetic_models_agrees_with_closed_forms():
     rows = []
     for kind, offset, slow in (("octahedron", 0.0, 1.0), ("gaussian", 1.0, 2.0)):
         for n, psnr, ms, core in power_law([1000, 2000, 4000], offset, slow):
@@ -108,7 +108,7 @@ def test_a_comparison_of_made_up_models():
         assert entry["psnr"]["gaussian"] == pytest.approx(15 + (end - 15) * math.log(10) / math.log(20))
 
 
-def test_thinness_is_that_of_the_shape():
+def test_thinness_is_the_ratio_of_axes():
     assert paper_models.thinness(np.array([[1.0, 2.0, 4.0]]), "octahedron") == pytest.approx(0.25)
     assert paper_models.thinness(np.array([[1.0, 2.0, 4.0]]), "gaussian") == pytest.approx(0.25)
     assert paper_models.thinness(np.full((3, 4), 0.7), "tetrahedron") == pytest.approx(1.0)
@@ -171,13 +171,13 @@ def brute_force(p: Primitives, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cells(mask: np.ndarray, size: int) -> int:
-    """Number of size x size cells of the image with a True."""
+    """Number of size x size cells of the image that contain a True."""
     rows, columns = np.nonzero(mask)
     return len(set(zip(rows // size, columns // size, strict=True)))
 
 
 def boxed(mask: np.ndarray) -> np.ndarray:
-    """The bounding box of what is True, a pixel larger on each side: no footprint reaches further."""
+    """The bounding box of True pixels, one pixel larger on each side, which contains every footprint."""
     rows, columns = np.nonzero(mask)
     out = np.zeros_like(mask)
     if len(rows):
@@ -186,7 +186,7 @@ def boxed(mask: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_counts_are_those_of_brute_force(kind):
+def test_counts_agree_with_brute_force(kind):
     p = some_primitives(kind, np.random.default_rng(3))
     hit, doubtful = brute_force(p, CAMERA)
     model = Model(p, np.zeros(3), [CAMERA], {"primitive": kind, "stop": 0.0, "samples": 1})
@@ -201,7 +201,7 @@ def test_counts_are_those_of_brute_force(kind):
     assert found["pixels"] == 40 * 32
 
 
-def test_counts_of_something_that_fills_the_image_are_all_its_pixels():
+def test_counts_of_a_primitive_that_fills_the_image():
     one = Primitives(
         np.array([[0, 0, 3.0]]),
         np.array([[1.0, 0, 0, 0]]),
@@ -281,13 +281,13 @@ def test_a_quick_run_writes_all_tables_and_a_second_one_trains_nothing(tmp_path,
         paper_tables.main([*command, "--scenes"])
 
 
-def test_a_variant_is_a_kind_and_a_rule_of_growth():
+def test_variants_are_parsed():
     assert Variant.parse("gaussian").name == "gaussian" and Variant.parse("gaussian:3dgs").name == "gaussian:3dgs"
     with pytest.raises(argparse.ArgumentTypeError, match="none of octahedron"):
         Variant.parse("cube")
 
 
-def test_workers_train_what_a_table_wants(tmp_path, capsys, monkeypatch):
+def test_workers_train_the_models_of_a_table(tmp_path, capsys, monkeypatch):
     command = ["--quick", "-o", str(tmp_path), "--iterations", "30", "--tables", "12", "--workers", "2"]
     begun = (
         tmp_path / "models" / "cad" / "octahedron_200"

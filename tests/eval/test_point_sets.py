@@ -1,4 +1,4 @@
-"""Lattices, thinned and averaged points against direct implementations, independent points against their floor."""
+"""Lattice, thinned, averaged and independent points, compared with direct implementations and closed forms."""
 
 import math
 
@@ -26,7 +26,7 @@ def test_a_lattice_has_one_point_per_cell_of_the_area_inside_the_faces():
 
 
 @pytest.mark.parametrize("start", [7, 60, 10**6])
-def test_thinning_is_that_of_going_through_the_points_one_by_one(monkeypatch, start):
+def test_thinning_agrees_with_sequential_removal(monkeypatch, start):
     monkeypatch.setattr("linprim_geo.eval.protocols.point_sets.THIN_START", start)
     random = np.random.default_rng(1)
     points = np.concatenate([random.random((300, 3)), 0.1 * random.integers(0, 4, (100, 3))])  # repeats, and ties
@@ -42,7 +42,7 @@ def test_thinning_is_that_of_going_through_the_points_one_by_one(monkeypatch, st
     assert len(thin(points, 5.0, 0)) == 1 and len(thin(points[:0], 0.1, 0)) == 0
 
 
-def test_cells_hold_the_mean_of_their_points():
+def test_cell_means_agree_with_a_direct_implementation():
     points = np.random.default_rng(0).random((500, 3)) + [1e6, 0, -3]
     low = points.min(axis=0)
     cells = {}
@@ -53,7 +53,7 @@ def test_cells_hold_the_mean_of_their_points():
     assert len(cell_means(points, 1e-9)) == 500  # more cells than an index of 64 bits would count
 
 
-def test_independent_points_have_the_floor_of_half_the_root_of_the_area_of_a_point():
+def test_mean_distance_of_independent_points_agrees_with_a_poisson_process():
     mesh, count = grid(7, 5), 20_000
     points = [sample_surface(mesh, count, seed, independent=True)[0] for seed in (1, 2)]
     distance = PointDistance(points[0]).query(points[1])[0]

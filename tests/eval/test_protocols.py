@@ -1,4 +1,4 @@
-"""The protocols of published tables against closed forms, their own floors, and direct implementations."""
+"""Protocols of published tables, compared with closed forms and direct implementations."""
 
 import dataclasses
 import json
@@ -39,7 +39,7 @@ def score(protocol, prediction, reference, **settings):
 # --- linprim ------------------------------------------------------------------------------------------------
 
 
-def test_linprim_has_the_floor_of_its_five_thousand_points():
+def test_linprim_distances_include_the_spacing_of_5000_points():
     result = score("linprim", grid(40, 20), grid(3, 3))
     assert result["chamfer"] == pytest.approx(0.5 * math.sqrt(2.0 / 5000), rel=0.04)
     assert result["samples"] == result["samples_reference"] == 5000 and result["normal_consistency"] == 1.0
@@ -52,7 +52,7 @@ def test_linprim_has_the_floor_of_its_five_thousand_points():
 
 
 @pytest.mark.parametrize("prediction", [wavy(), grid(40, 20)], ids=["apart", "coincident"])
-def test_the_standard_error_of_point_to_point_is_the_spread_over_seeds_or_a_little_more(prediction):
+def test_standard_errors_of_point_distances_agree_with_the_spread_over_seeds(prediction):
     results = [score("linprim", prediction, grid(), samples=400, seed=seed) for seed in range(40)]
     for key, error in (("chamfer", "standard_error"), ("f1", "f1_standard_error")):
         spread = np.std([result[key] for result in results], ddof=1)
@@ -86,15 +86,15 @@ def planes():
     ("offset", "expected"),
     [(0.0, 0.106), (0.1, 0.149), (0.2, 0.230), (0.3, 0.321), (0.4, 0.416), (0.5, 0.513)],
 )
-def test_dtu_has_a_floor_of_a_tenth_of_a_millimetre_under_every_offset(planes, offset, expected):
+def test_dtu_distances_include_the_spacing_of_points(planes, offset, expected):
     result = score("dtu", moved(planes[0], 0, 0, offset), planes[1], metre=1000.0)
-    # Which points the shuffle leaves moves the third digit.
+    # Random thinning changes the third digit.
     assert result["chamfer"] == pytest.approx(expected, abs=0.0015)
     assert result["kept_prediction"] == result["kept_reference"] == 1.0 and result["normal_consistency"] is None
     assert result["points_before_thinning"] > result["samples"] > 40_000
 
 
-def test_dtu_scores_a_scan_as_it_is_in_any_unit_and_frame(planes):
+def test_dtu_scores_scans_independently_of_unit_and_position(planes):
     scan = np.random.default_rng(0).random((200_000, 3)) * [60, 60, 0]
     result = score("dtu", planes[0], scan, metre=1000.0)
     assert result["samples_reference"] == 200_000
@@ -146,7 +146,7 @@ def plane_of(equilateral, cells=30, edge=4.0, turn=0.3):
 
 
 @pytest.mark.parametrize("equilateral", [True, False])
-def test_tnt_recall_of_a_perfect_plane_depends_on_its_triangles_unless_points_are_uniform(equilateral):
+def test_tnt_recall_depends_on_the_triangulation_unless_points_are_uniform(equilateral):
     mesh = plane_of(equilateral)
     result = score("tnt", mesh, mesh, tau=1.0)
     # Discs of radius 1 around the vertices (one per two triangles) and the centroids (two); those of the
@@ -163,7 +163,7 @@ def test_tnt_recall_of_a_perfect_plane_depends_on_its_triangles_unless_points_ar
     assert result["tau"] == 1.0 and result["normal_consistency"] is None and result["registration"] == "none"
 
 
-def test_tnt_threshold_is_exclusive_and_the_scenes_own():
+def test_tnt_threshold_is_exclusive_and_depends_on_the_scene():
     points = np.array([[0.0, 0, 0], [5, 0, 0]])
     flat = Mesh(np.array([[0.0, 0, 0.25], [5, 0, 0.25], [2.5, 1e-3, 0.25]]), np.array([[0, 1, 2]]))
     assert score("tnt", flat, points, tau=0.25)["recall"] == 0.0
@@ -193,7 +193,7 @@ def test_tnt_crops_both_to_the_polygon():
 # --- scannetpp ----------------------------------------------------------------------------------------------
 
 
-def test_scannetpp_keeps_what_more_than_three_cameras_see():
+def test_scannetpp_keeps_faces_seen_by_more_than_three_cameras():
     floor, cellar = grid(3, 3, (1.0, 1.0)), moved(grid(3, 3, (1.0, 1.0)), 0, 0, -0.1)
     cameras = [camera_above(2.0 + 0.1 * k, target=(0.5, 0.5)) for k in range(4)]
     result = score("scannetpp", join(floor, cellar), floor, cameras=cameras)
@@ -220,7 +220,7 @@ def test_scannetpp_keeps_what_more_than_three_cameras_see():
     assert scaled["chamfer"] == pytest.approx(1000 * result["chamfer"], rel=1e-6) and scaled["tau"] == 50.0
 
 
-def test_rays_to_vertices_that_slip_are_counted_and_do_no_harm():
+def test_rays_that_slip_between_triangles_are_recast():
     mesh = refine(sphere(1.0, 0), 0.04)  # an octahedron, cut finely: faces towards the camera are those of z > 0
     caster = RayCaster(mesh.vertices, mesh.faces)
     views = count_views(caster, mesh.vertices, [camera_above(3.0)] * 5, 1e-3, enough=4)
@@ -237,7 +237,7 @@ def test_small_far_and_broken_meshes_are_scored_by_every_protocol(name):
     cameras = [camera_above(2.0 + 0.1 * k, target=(0.5, 0.5)) for k in range(4)]
     settings = {
         "linprim": {},
-        # Not a length that 0.2 mm divides: lattices at exactly the radius of the thinning hang on rounding.
+        # Not a multiple of 0.2 mm: lattices with exactly the radius of the thinning depend on rounding.
         "dtu": {"metre": 21.3},
         "tnt": {"tau": 0.05},
         "scannetpp": {"cameras": cameras},
@@ -259,7 +259,7 @@ def test_small_far_and_broken_meshes_are_scored_by_every_protocol(name):
 
 
 @pytest.mark.parametrize("protocol", ["linprim", "dtu", "tnt"])
-def test_faces_that_are_degenerate_repeated_or_nan_change_nothing(protocol, tmp_path):
+def test_degenerate_repeated_and_nan_faces_change_nothing(protocol, tmp_path):
     clean = wavy()
     n = len(clean.vertices)
     vertices = np.concatenate([clean.vertices, [[np.nan, 0, 0], [np.inf, 0, 0], [9.0, 9, 9]]])
@@ -277,7 +277,7 @@ def test_faces_that_are_degenerate_repeated_or_nan_change_nothing(protocol, tmp_
     assert b["dropped"]["prediction"] == {"not_finite": 2, "degenerate": 2, "duplicate": 2, "unreferenced": 3}
 
 
-def test_every_protocol_is_a_choice():
+def test_every_protocol_is_an_option():
     assert options.PROTOCOLS == ("headline", *PROTOCOLS)
     assert options.TAKEN_BY.keys() < {field.name for field in dataclasses.fields(options.ScoreOptions)}
 
@@ -299,7 +299,7 @@ def run_command(line, capsys):
     return (json.loads(shown.out), "") if status == 0 else (status, shown.err)
 
 
-def test_dtu_by_command_with_the_files_of_the_benchmark(meshes, capsys):
+def test_dtu_command_with_files_of_the_benchmark(meshes, capsys):
     grid_of_cells = np.ones((80, 80, 3), np.uint8)
     grid_of_cells[40:] = 0
     savemat(
@@ -317,7 +317,7 @@ def test_dtu_by_command_with_the_files_of_the_benchmark(meshes, capsys):
     assert by_text["kept_reference"] == result["kept_reference"] and by_text["kept_prediction"] == 1.0
 
 
-def test_tnt_by_command_with_a_scan_a_crop_and_a_transform(meshes, capsys):
+def test_tnt_command_with_scan_crop_and_transform(meshes, capsys):
     scan = np.random.default_rng(0).random((30_000, 3)) * [60, 60, 0]
     rows = "\n".join(f"{x} {y} {z}" for x, y, z in scan)
     head = "ply\nformat ascii 1.0\nelement vertex 30000\nproperty float x\nproperty float y\nproperty float z\n"
@@ -338,7 +338,7 @@ def test_tnt_by_command_with_a_scan_a_crop_and_a_transform(meshes, capsys):
     assert "element vertex 30000" in header and "property float quality" in header and "face" not in header
 
 
-def test_scannetpp_and_visible_by_command_with_the_cameras_of_a_scene(tiny_scene, tmp_path, capsys):
+def test_scannetpp_and_headline_commands_with_cameras_of_a_scene(tiny_scene, tmp_path, capsys):
     mesh = sphere(0.8, 3)
     save_mesh(tmp_path / "ball.ply", mesh)
     save_mesh(tmp_path / "more.ply", join(mesh, sphere(0.2, 2)))
@@ -355,7 +355,7 @@ def test_scannetpp_and_visible_by_command_with_the_cameras_of_a_scene(tiny_scene
     assert result["culling"].startswith("faces seen by more than 3 of 12 cameras")
 
 
-def test_a_run_keeps_each_protocol_in_a_folder_of_its_own(meshes):
+def test_each_protocol_has_its_own_output_folder_in_a_run(meshes):
     view = SimpleNamespace(camera=camera_above(90.0, target=(30.0, 30.0)))
     scene = SimpleNamespace(train=(view,) * 4, unit="mm")
     run = SimpleNamespace(path=meshes / "run", scene=lambda: scene)
@@ -421,7 +421,7 @@ def test_what_does_not_fit_is_one_sentence(options, sentence, meshes, capsys):
     assert not (meshes / "out").exists()
 
 
-def test_points_are_a_reference_only_where_the_protocol_has_scans(meshes, capsys):
+def test_point_references_are_accepted_only_by_protocols_with_scans(meshes, capsys):
     head = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     (meshes / "scan.ply").write_text(head + "0 0 0\n1 1 0\n")
     (meshes / "nan.ply").write_text(head + "nan 0 0\nnan 1 0\n")

@@ -1,4 +1,4 @@
-"""Scores of how a surface looks, on surfaces where they are known."""
+"""Shape scores on surfaces where they are known in closed form."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from linprim_geo.geometry.mesh import Mesh
 
 
 def cube(steps: int = 4, size: float = 1.0) -> Mesh:
-    """Its six sides have vertices of their own; normals point outwards."""
+    """A cube whose six sides have separate vertices, with outward normals."""
     side, sides = grid(steps, steps, size=(size, size), height=size), []
     for axis in range(3):
         turned = np.roll(side.vertices, axis, axis=1)
@@ -44,14 +44,14 @@ def test_a_cube_has_twelve_creases_and_six_planes():
         assert np.ptp(mesh.vertices[mesh.faces[region == number]].reshape(-1, 3), axis=0).min() == 0
 
 
-def test_a_round_surface_has_neither():
+def test_a_sphere_has_no_creases_and_no_planes():
     mesh = sphere(rounds=5)
     assert len(crease_lines(mesh).faces) == 0 and (flat_regions(mesh) == -1).all()
     assert np.isinf(distance_to_lines(crease_lines(mesh), mesh.vertices)).all()
     assert sample_lines(crease_lines(mesh), 10, 0).shape == (0, 3)
 
 
-def test_distances_to_lines_are_exact_and_samples_even():
+def test_distances_to_lines_are_exact_and_samples_uniform():
     lines, rng = crease_lines(cube()), np.random.default_rng(0)
     points = rng.uniform(-0.5, 1.5, (300, 3))
     off = np.stack([np.maximum(-points, 0) + np.maximum(points - 1, 0), np.abs(points), np.abs(points - 1)])
@@ -65,7 +65,7 @@ def test_distances_to_lines_are_exact_and_samples_even():
     assert on_top == pytest.approx(400, abs=4)  # four of twelve edges
 
 
-def test_angles_are_those_of_a_tilted_plane():
+def test_normal_angles_of_a_tilted_plane_are_exact():
     slope = math.tan(math.radians(7))
     flat = grid(5, 4)
     ramp = replace(flat, vertices=flat.vertices + slope * flat.vertices[:, :1] * [0, 0, 1])
@@ -77,27 +77,27 @@ def test_angles_are_those_of_a_tilted_plane():
     assert math.isnan(angle_scores([np.zeros(0), np.ones(3)])["mean"])
 
 
-def test_a_shifted_crease_is_as_far_as_it_is_shifted():
+def test_crease_distance_of_a_shifted_cube_agrees_with_the_closed_form():
     shape = score_mesh(replace(cube(), vertices=cube().vertices + [0.004, 0, 0]), cube(), samples=20_000)["shape"]
-    # Of the twelve edges four lie along the shift, and come off at their ends alone.
+    # Four of the twelve edges are parallel to the shift and differ only at their ends.
     assert shape["creases"]["chamfer"] == pytest.approx(0.004 * 8 / 12, rel=0.02)
     assert shape["creases"]["precision"] == shape["creases"]["recall"] == 1
     assert shape["creases"]["chamfer_percent_diagonal"] == pytest.approx(100 * shape["creases"]["chamfer"] / 3**0.5)
     assert shape["flatness"]["rms"] < 1e-12 and shape["flatness"]["planes"] == 6
 
 
-def test_without_its_top_the_creases_around_it_are_missing():
+def test_crease_recall_of_an_open_cube_agrees_with_the_closed_form():
     top = np.flatnonzero((cube().vertices[cube().faces][..., 2] == 1).all(1))
     open_cube = Mesh(cube().vertices, np.delete(cube().faces, top, axis=0))
     shape = score_mesh(open_cube, cube(), samples=20_000)["shape"]
     tau = 0.01 * 3**0.5
     assert shape["creases"]["precision"] == 1
-    # The ends of the four upright edges are near to the ones that are missing.
+    # The ends of the four vertical edges are within tau of missing edges.
     assert shape["creases"]["recall"] == pytest.approx((8 + 8 * tau) / 12, abs=0.005)
     assert shape["flatness"]["planes"] == 5
 
 
-def test_waves_on_a_plane_are_its_flatness_whatever_its_offset():
+def test_flatness_is_the_rms_of_waves_without_offset():
     reference = grid(10, 10)
     fine = grid(200, 100)
     waves = 0.003 * np.sin(8 * np.pi * fine.vertices[:, 0]) + 0.005
@@ -106,7 +106,7 @@ def test_waves_on_a_plane_are_its_flatness_whatever_its_offset():
     assert shape["flatness"]["rms"] == pytest.approx(0.003 / math.sqrt(2), rel=0.01)
 
 
-def test_what_no_camera_sees_does_not_count_among_what_is_seen():
+def test_visible_shape_scores_ignore_unseen_planes():
     flat = grid(4, 4, size=(2.0, 2.0))
     block = replace(cube(), vertices=cube().vertices * 0.5 + [0.75, 0.75, 0])
     mesh = join(flat, block)

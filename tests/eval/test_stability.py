@@ -1,4 +1,4 @@
-"""The hard cases on every variant of the ladder, the table of them, and the table's own reference."""
+"""Numerically hard cases for every variant of the rasterizer, their table, and its reference."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 
 
 @pytest.mark.parametrize("primitive,name", [(p, n) for n, c in CLASSES.items() for p in c.primitives])
-def test_hard_classes_hold(primitive, name):
+def test_hard_cases_meet_their_bounds(primitive, name):
     # A few of the many cases of `python -m linprim_geo.eval.hard_cases.stability`; each of those is as good.
     chosen = [r for r in compiled.variants() if r.primitive == primitive]
     count = {"coincident": 4, "denormal axes": 40, "overflowing axes": 40}.get(name, 20)
@@ -33,7 +33,7 @@ def test_hard_classes_hold(primitive, name):
 
 @pytest.mark.parametrize("name", [n for n, c in CLASSES.items() if c.value and not c.ties])
 @pytest.mark.parametrize("ray_model", ["exact", "affine"])
-def test_the_reference_of_many_scenes_is_the_twin(name, ray_model):
+def test_many_scenes_agree_with_the_float64_reference(name, ray_model):
     for primitive in CLASSES[name].primitives:
         count = 2
         scenes = generate(name, primitive, ray_model, count, seed=2)
@@ -91,7 +91,7 @@ def exact_thickness(scenes, index: int) -> float:
     "name",
     ["ordinary", "needles 1e9", "plates 1e9", "a thousandth of a pixel", "a million units away", "huge axes"],
 )
-def test_the_reference_of_many_scenes_is_exact_arithmetic(name):
+def test_many_scenes_agree_with_exact_arithmetic(name):
     scenes = generate(name, "octahedron", "exact", 6, seed=3)
     tau = many_scenes.chords(scenes).tau
     for i in range(6):
@@ -100,7 +100,7 @@ def test_the_reference_of_many_scenes_is_exact_arithmetic(name):
         assert float(tau[i, scenes.aimed[i], 0]) == pytest.approx(wanted, rel=1e-5, abs=1e-12)
 
 
-def test_every_class_is_drawn_and_says_what_it_is():
+def test_every_class_generates_hits_and_has_a_description():
     for name, what in CLASSES.items():
         assert what.about and what.name == name
         for primitive in what.primitives[:2]:
@@ -125,7 +125,7 @@ def test_the_command_prints_its_table_as_json(capsys):
         assert set(row) >= {"name", "primitive", "variant", "cases", "worst_relative_error", "nonfinite"}
 
 
-def test_the_command_fails_where_a_figure_does(capsys, monkeypatch):
+def test_the_command_fails_if_a_bound_is_exceeded(capsys, monkeypatch):
     arguments = ["--cases", "16", "--gradients", "12", "--classes", "ordinary", "--primitives", "octahedron"]
     assert stability.main(arguments) == 0
     monkeypatch.setattr(stability, "BOUND", 1e-9)
@@ -145,7 +145,7 @@ def test_the_command_fails_where_a_figure_does(capsys, monkeypatch):
         ({"gradient": math.nan}, "magnitude"),
     ],
 )
-def test_figures_name_what_does_not_hold(change, word):
+def test_figures_name_exceeded_bounds(change, word):
     good = dict(name="ordinary", primitive="octahedron", variant="exact-center-float32", cases=100, gradient_cases=100)
     assert not stability.Figures(**good).problems()
     (problem,) = stability.Figures(**good, **change).problems()

@@ -1,4 +1,4 @@
-"""The study of dense stereo: the law that it fits, and its tables."""
+"""The study of dense stereo: its logistic fit and its tables."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from linprim_geo.stereo.confidence import WEIGHTS, probability
 
 
 def capture(weights: np.ndarray, count: int, seed: int) -> dict:
-    """What is measured of a capture whose depths follow the law with these weights."""
+    """Synthetic measurements of a capture that follow the model with these weights."""
     rng = np.random.default_rng(seed)
     found = rng.uniform(size=(count, len(weights)))
     found[:, 0] = 1
@@ -24,7 +24,7 @@ def capture(weights: np.ndarray, count: int, seed: int) -> dict:
     }
 
 
-def test_the_fit_finds_the_weights_that_made_the_data():
+def test_the_fit_recovers_the_weights_of_synthetic_data():
     weights = np.array([-0.5, 0.4, 1.5, -2.0, 0.5, 1.0])
     captures = [capture(weights, 40_000, 1), capture(weights, 60_000, 2)]
     found = np.concatenate([each["evidence"] for each in captures])
@@ -35,7 +35,7 @@ def test_the_fit_finds_the_weights_that_made_the_data():
     assert (np.abs(fit(captures) - weights) < 4 * error).all()
 
 
-def test_the_table_of_a_law_that_holds_is_a_diagonal():
+def test_reliability_of_a_calibrated_model_is_diagonal():
     one = capture(WEIGHTS, 50_000, 3)
     rows = reliability([one])
     assert abs(sum(each["share"] for each in rows) - 1) < 1e-6

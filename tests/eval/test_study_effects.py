@@ -37,11 +37,11 @@ def row(psnr, depth, called_for, decided_on, reason="data"):
         (0.5, -7.0, True, True, "right: gains"),
     ],
 )
-def test_verdicts(psnr, depth, called_for, decided_on, expected):
+def test_verdicts_follow_gains_and_decisions(psnr, depth, called_for, decided_on, expected):
     assert effects.verdict(row(psnr, depth, called_for, decided_on), SPREAD, SEEDS) == expected
 
 
-def test_what_is_kept_asked_for_or_ruled_out_is_not_called_for():
+def test_verdicts_of_kept_requested_and_impossible_effects():
     assert effects.verdict(row(0.0, 0.0, False, True, "kept"), SPREAD, SEEDS) == "right: no change, kept"
     assert effects.verdict(row(-0.5, 0.0, False, True, "kept"), SPREAD, SEEDS) == "wrong: loses, kept"
     assert effects.verdict(row(0.5, 0.0, False, False, "request"), SPREAD, SEEDS) == "gains, on request"

@@ -1,5 +1,4 @@
-"""The ladder of degradations: every rung is a capture that can be made, a row is measured once, and ratios are to ideal
-photographs."""
+"""The ladder of degradations: captures of all rungs, rows that are measured once, and ratios to ideal photographs."""
 
 from __future__ import annotations
 
@@ -35,7 +34,7 @@ def test_two_rungs_are_made_trained_and_scored_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("scene", "rung"), [("smooth", "motion blur 0.8 px"), ("room", "phone")])
-def test_what_masks_exclude_can_be_photographed(tmp_path, scene, rung):
+def test_rungs_without_masks_can_be_synthesised(tmp_path, scene, rung):
     settings = ladder.settings_of(scene, rung) | {"views": 8, "test_views": 2, "points": 50, "supersample": 1}
     synthesize(tmp_path / "out", shape=scene, size=(96, 96), **settings)
     assert not load_scene(tmp_path / "out").has_alpha

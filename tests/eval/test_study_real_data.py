@@ -1,4 +1,4 @@
-"""The script that trains and scores a folder of captures: what it finds, and that it deletes nothing of the user's."""
+"""The script that trains and scores a folder of captures; it deletes no files of the user."""
 
 import contextlib
 import io
@@ -25,7 +25,7 @@ def data(tmp_path_factory):
     return folder
 
 
-def test_captures_are_the_folders_that_hold_posed_images(data):
+def test_captures_are_folders_with_posed_images(data):
     assert [c.name for c in real_data.captures(data, [])] == ["part_small"]
     with pytest.raises(LinprimError, match="no capture named other"):
         real_data.captures(data, ["other"])
@@ -33,7 +33,7 @@ def test_captures_are_the_folders_that_hold_posed_images(data):
         real_data.captures(data / "notes", [])
 
 
-def test_the_reference_is_the_captures_own_or_the_longest_name_that_fits(data, tmp_path):
+def test_the_reference_is_in_the_capture_or_has_the_longest_matching_name(data, tmp_path):
     assert real_data.reference_of(data / "part_small", data).name == "reference.ply"
     (tmp_path / "meshes").mkdir()
     for name in ("part.ply", "part_b.obj", "other.ply"):
@@ -75,7 +75,7 @@ def test_a_table_is_written(written):
     assert text.strip() in said and "| part_small | 10+2 | 40x40 |" in text and "* part_small: " in text
 
 
-def test_workers_give_the_same_scores_and_an_earlier_run_is_replaced(data, written, tmp_path):
+def test_workers_give_the_same_scores_and_replace_earlier_runs(data, written, tmp_path):
     out = Path(shutil.copytree(written, tmp_path / "out"))
     (out / "part_small" / "scene.npz").write_bytes(b"of an earlier run")
     real_data.main(["--data", str(data), "-o", str(out), "--workers", "2", *OPTIONS])

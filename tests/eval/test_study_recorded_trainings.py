@@ -1,4 +1,4 @@
-"""What is made of the results of recorded trainings; tests/training/test_recorded_trainings.py trains."""
+"""Evaluation of recorded trainings, which tests/training/test_recorded_trainings.py runs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from linprim_geo.eval.studies.recorded_trainings import StepTiming, add_row, ban
 from linprim_geo.kernels import ops
 
 
-def test_one_more_value_lies_outside_the_band_as_often_as_it_says(monkeypatch):
+def test_the_band_has_the_stated_rate_of_false_alarms(monkeypatch):
     monkeypatch.setattr(recorded_trainings, "FALSE_ALARMS", 0.1)
     rng, outside, trials = np.random.default_rng(1), 0, 4000
     for _ in range(trials):
@@ -24,12 +24,12 @@ def test_one_more_value_lies_outside_the_band_as_often_as_it_says(monkeypatch):
     assert abs(outside / trials - 0.1) < 4 * np.sqrt(0.1 * 0.9 / trials)
 
 
-def test_two_values_make_no_band():
+def test_two_values_are_too_few_for_a_band():
     with pytest.raises(LinprimError, match="2 values tell nothing"):
         band([1.0, 2.0])
 
 
-def test_a_row_takes_the_place_of_the_same_training(tmp_path):
+def test_rows_of_the_same_training_are_replaced(tmp_path):
     path = tmp_path / "rows.json"
     for scene, instruction_set, seed, psnr in (
         ("room", "v3", 0, 1.0),
@@ -42,16 +42,16 @@ def test_a_row_takes_the_place_of_the_same_training(tmp_path):
     assert [row["psnr"] for row in read_rows(path)] == [4.0, 5.0, 2.0, 1.0]
 
 
-def test_a_file_without_rows_is_one_sentence(tmp_path):
+def test_a_file_without_rows_is_refused(tmp_path):
     path = tmp_path / "rows.json"
     path.write_text('{"scene": "cad"}')
     with pytest.raises(LinprimError, match=r"rows\.json: holds no list, wanted rows"):
         read_rows(path)
 
 
-def test_steps_are_timed_against_the_limits_of_their_pairs(monkeypatch):
-    """Every fifth of the last steps; a step of 3 s whose pairs take 2 s at the limit is 1.5 times as slow, and most of
-    them are disturbed."""
+def test_steps_are_timed_relative_to_the_machine_limit(monkeypatch):
+    """Some of the last steps are timed. An undisturbed step takes 3 s and its pairs 2 s at the limit, so the ratio is
+    1.5, although most steps are disturbed."""
     clock, seconds = [0.0], iter([3.0, 3.0, *[9.0] * 8])
     trainer = SimpleNamespace(step=recorded_trainings.TIMED_FROM - 50)
 

@@ -1,4 +1,4 @@
-"""The fits and predictions of cost, the street, and the tables of both scripts, on sizes that take seconds."""
+"""Fits and predictions of cost, the street, and tables of both scripts at small sizes."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def rows_of(true: scaling.Fit, noise: float = 0.0) -> list[dict]:
     return rows
 
 
-def test_a_fit_finds_the_numbers_that_made_its_rows():
+def test_the_fit_recovers_the_costs_of_synthetic_rows():
     found = scaling.fit(rows_of(TRUE)[:-1])
     for name in ("setup", "step", "memory", "filling"):
         assert np.allclose(getattr(found, name), getattr(TRUE, name), rtol=1e-6), name
 
 
-def test_the_check_is_of_a_size_that_was_not_fitted():
+def test_the_check_compares_a_size_that_was_not_fitted():
     rows = rows_of(TRUE, 0.02)
     checked = scaling.check(scaling.fit(rows[:-1]), rows[-1])
     assert all(0.9 < value["ratio"] < 1.1 for value in checked.values())
@@ -49,7 +49,7 @@ def test_the_check_is_of_a_size_that_was_not_fitted():
     assert scaling.check(scaling.fit(rows[:-1]), rows[-1])["gib"]["ratio"] == pytest.approx(checked["gib"]["ratio"] / 2)
 
 
-def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
+def test_predicted_costs_grow_with_photographs_but_not_per_worker():
     some, many = (scaling.predict(TRUE, photos, scaling.Capture()) for photos in (1e4, 1e6))
     assert some["blocks"] == 125 and many["blocks"] == 12500
     for name in ("core_hours", "storage_gib", "network_gib"):
@@ -70,7 +70,7 @@ def test_predictions_grow_with_the_photographs_and_a_worker_does_not():
     assert some["longest_task_hours"] == pytest.approx(max(first, coarse, planning))
 
 
-def test_a_long_street_has_as_much_room_for_cameras_as_a_short_one():
+def test_cameras_are_inside_a_long_street():
     mesh = street(8)
     views, held_out = inside_out(RayCaster(mesh.vertices, mesh.faces), 12, 2, (0.5, 0.5), 0)
     eyes = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in views])
@@ -78,7 +78,7 @@ def test_a_long_street_has_as_much_room_for_cameras_as_a_short_one():
     assert ((eyes[:, 1] > 0) & (eyes[:, 1] < WIDTH) & (eyes[:, 2] > 0) & (eyes[:, 2] < HEIGHT)).all()
 
 
-def test_a_street_is_a_closed_surface_seen_from_inside():
+def test_a_street_is_closed_and_reproducible():
     mesh = street(2)
     assert np.allclose(mesh.vertices.max(0)[[0, 2]], (2 * HOUSE, HEIGHT)) and np.ptp(mesh.vertices[:, 1]) >= WIDTH
     caster = RayCaster(mesh.vertices, mesh.faces, threads=1)
@@ -90,7 +90,7 @@ def test_a_street_is_a_closed_surface_seen_from_inside():
     )
 
 
-def test_distances_are_to_borders_between_blocks_only():
+def test_border_distance_uses_borders_between_blocks_only():
     blocks = [Block((-np.inf,) * 3, (1.0, np.inf, np.inf)), Block((1.0, -np.inf, -np.inf), (np.inf, 0.0, np.inf))]
     points = np.array([[0.0, 5, 5], [0.9, -5, 5], [1.5, -0.2, 0], [9.0, -7, 0], [2.0, 3.0, 0.0]])
     assert np.allclose(block_quality.border_distance(blocks, points), [1.0, 0.1, 0.2, 7.0, np.inf])
@@ -107,7 +107,7 @@ def test_scaling_measures_fits_and_writes_its_table(tmp_path, monkeypatch, few_t
     text = (tmp_path / "scaling.md").read_text()
     assert "| 10000 |" in text and "| 1000000 |" in text and "Checked on a size" in text
     monkeypatch.setattr(scaling, "measure_task", None)
-    assert scaling.run(given)["rows"] == result["rows"]  # what is measured is not measured again
+    assert scaling.run(given)["rows"] == result["rows"]  # rows are not measured again
 
 
 @pytest.mark.slow

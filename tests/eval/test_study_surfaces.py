@@ -1,4 +1,4 @@
-"""The table of surfaces: a scene, its mesh and its row, and nothing that is there is done again."""
+"""The table of surfaces: meshes and rows of scenes, computed only once."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_scene_is_trained_meshed_and_scored_once(tmp_path, monkeypatch, capsys
     assert exact["chamfer"] < 0.5
 
 
-def test_a_capture_without_a_reference_has_photographs_and_depth_images_alone(tmp_path):
+def test_captures_without_a_reference_are_scored_by_images_and_depths(tmp_path):
     synthesize(tmp_path / "ball", shape="smooth", views=6, test_views=2, size=(48, 48), points=200)
     command = ["-o", str(tmp_path / "out"), "--scenes", "--data", str(tmp_path / "ball"), "--references", "none"]
     command += ["--iterations", "40", "--max-primitives", "300", "--primitives", "octahedron", "--methods", "tsdf"]
@@ -52,7 +52,7 @@ def test_a_capture_without_a_reference_has_photographs_and_depth_images_alone(tm
     assert options.start == "points" and options.stereo_depth == 0
 
 
-def test_depth_of_a_mesh_is_right_within_one_percent_of_the_depth_images(tmp_path):
+def test_depth_right_of_exact_and_enlarged_meshes(tmp_path):
     synthesize(tmp_path / "ball", shape="smooth", views=6, test_views=2, size=(48, 48), points=200, depth_format="npy")
     views = load_scene(tmp_path / "ball").train
     mesh = load_mesh(tmp_path / "ball" / "reference.ply")
@@ -63,11 +63,11 @@ def test_depth_of_a_mesh_is_right_within_one_percent_of_the_depth_images(tmp_pat
     assert surfaces.depth_right(mesh, [replace(view, depth_path=None) for view in views]) is None
 
 
-def test_rows_of_earlier_folders_lack_what_is_new():
+def test_tables_show_missing_columns_of_old_rows():
     *_, line = surfaces.table([{"scene": "cad", "chamfer": 0.07, "manifold": None}]).splitlines()
     assert line.startswith("| cad | – | – | – | – | – | 0.07 | – |")
 
 
-def test_references_go_with_captures(tmp_path, capsys):
+def test_captures_without_references_option_are_refused(tmp_path, capsys):
     assert surfaces.main(["-o", str(tmp_path), "--data", str(tmp_path), "--scenes"]) == 1
     assert "0 references go with 1 captures" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The sweep of parameters: every value sets something that runs, is timed and judged, and the files agree."""
+"""Sweeps of parameters: every value runs, is timed and judged, and the output files agree."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MEASURED = (*RENDERED, "extraction", "samples")
 
 @pytest.fixture(scope="module")
 def swept(tiny_scene, tiny_run, tmp_path_factory):
-    """Everything that needs no training, on `tiny_run`, whose files stay as they are."""
+    """A sweep of all parameters without training, on `tiny_run`, whose files stay unchanged."""
     out = tmp_path_factory.mktemp("tradeoff") / "sweep"
     before = {path: path.stat().st_mtime_ns for path in tiny_run.rglob("*")}
     with pytest.MonkeyPatch.context() as patch:
@@ -41,7 +41,7 @@ def swept(tiny_scene, tiny_run, tmp_path_factory):
     return out, results
 
 
-def test_every_value_was_timed_and_judged(swept):
+def test_every_value_is_timed_and_judged(swept):
     out, results = swept
     assert "failed" not in (out / "measured.json").read_text()
     for name in MEASURED:
@@ -56,7 +56,7 @@ def test_every_value_was_timed_and_judged(swept):
             assert all(row[error] is not None and row[error] >= 0 for error in PARAMETERS[name].errors), row
 
 
-def test_the_errors_are_those_of_the_parameter(swept):
+def test_errors_depend_on_parameters_as_expected(swept):
     rows = {(row["parameter"], row["value"]): row for row in swept[1]["rows"]}
     # The integral itself differs from the reference by rounding and the early stop alone, the order of centres by more.
     assert rows["order", "overlap"]["image_percent"] < 0.2 * rows["order", "center"]["image_percent"]
@@ -85,7 +85,7 @@ def test_csv_and_json_agree(swept):
 
 
 class Tags(HTMLParser):
-    """Checks that every tag is closed in its turn."""
+    """Parser that checks the nesting of tags."""
 
     def __init__(self):
         super().__init__()
@@ -102,7 +102,7 @@ class Tags(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_well_formed_and_stands_alone(swept):
+def test_the_page_is_well_formed_and_self_contained(swept):
     out, results = swept
     text = (out / "tradeoff.html").read_text(encoding="utf-8")
     tags = Tags()
@@ -118,7 +118,7 @@ def test_the_page_is_well_formed_and_stands_alone(swept):
     assert all(sentence in words for sentence in results["sentences"].values()) and results["rule"] in words
 
 
-def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run, monkeypatch):
+def test_measurements_are_reused(swept, tiny_scene, tiny_run, monkeypatch):
     out, results = swept
     for name in ("_render", "_extract", "_evaluate", "_train"):
         monkeypatch.setattr(sweeping.Sweep, name, lambda *_: pytest.fail("measured again"))
@@ -130,8 +130,8 @@ def test_what_was_measured_is_taken_from_the_folder(swept, tiny_scene, tiny_run,
 
 @pytest.fixture(scope="module")
 def photographs(tmp_path_factory):
-    """A scene without points, so trainings begin in the visual hull at once, and without a reference surface, so no
-    mesh is extracted for its score."""
+    """A scene without points, so that training starts from the visual hull, and without a reference, so that no mesh is
+    extracted."""
     out = tmp_path_factory.mktemp("photographs") / "scene"
     synthesize(out, shape="cad", views=6, test_views=2, size=32, points=0, supersample=1)
     (out / "reference.ply").unlink()
@@ -139,13 +139,13 @@ def photographs(tmp_path_factory):
 
 
 def shortened(monkeypatch, name, *values):
-    """Leaves a parameter those of its values alone."""
+    """Restrict a parameter to these values."""
     each = PARAMETERS[name]
     monkeypatch.setitem(PARAMETERS, name, replace(each, values=tuple(r for r in each.values if r.name in values)))
 
 
 def test_training_parameters_run_on_every_value(tiny_scene, tmp_path, monkeypatch):
-    """A few steps each; how runs are scored is tested by the ones that score."""
+    """Trainings have a few steps, and scores are replaced."""
     monkeypatch.setattr(
         "linprim_geo.points.start_points.fill_gaps", lambda scene, *_: scene.points
     )  # seconds for every value
@@ -177,7 +177,7 @@ def test_training_parameters_run_on_every_value(tiny_scene, tmp_path, monkeypatc
     assert equal == max(1, round(8 * base / other))
 
 
-def test_trainings_by_workers_are_those_of_this_process(monkeypatch, photographs, tmp_path):
+def test_workers_give_the_same_trainings(monkeypatch, photographs, tmp_path):
     shortened(monkeypatch, "primitive", "octahedron", "gaussian", "gaussian, equal time")
     how = {
         "parameters": ["primitive"],
@@ -198,7 +198,7 @@ def test_trainings_by_workers_are_those_of_this_process(monkeypatch, photographs
     assert "base" in names and not [name for name in names if name.startswith("round_") or name == "again"]
 
 
-def test_a_sweep_by_workers_goes_on_and_tells_what_fails(monkeypatch, photographs, tmp_path):
+def test_a_sweep_by_workers_resumes_and_reports_failures(monkeypatch, photographs, tmp_path):
     shortened(monkeypatch, "iterations", "1/4", "1/2", "1")
     monkeypatch.setattr(sweeping, "open_executor", Here)
     how = {
@@ -246,7 +246,7 @@ def test_a_trained_run_is_scored_by_image_depth_and_surface(swept, tiny_scene, t
     assert 0 < found["depth_percent"] < 10 and 0 < found["chamfer_percent"] < 5
 
 
-def test_what_cannot_be_swept_is_one_sentence(swept, tiny_scene, tiny_run, tmp_path):
+def test_invalid_sweeps_are_refused(swept, tiny_scene, tiny_run, tmp_path):
     out, _ = swept
     with pytest.raises(LinprimError, match="--parameters nonsense is unknown, wanted some of rays, order"):
         tradeoff(tiny_scene, tmp_path / "x", parameters=("nonsense",), quiet=True)

@@ -1,5 +1,4 @@
-"""The plots of the documents out of a sweep: what they show of known rows, that they are well-formed and light or dark,
-and what is refused."""
+"""Plots of a sweep for the documentation: contents for known rows, light and dark colours, and invalid input."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def sweep(folder, leave_out=(), chamfer=True):
-    """A tradeoff.json whose every value takes longer and errs less than the one before it."""
+    """Write a tradeoff.json in which each value takes longer and has a smaller error than the one before."""
     rows = []
     for parameter in PARAMETERS.values():
         if parameter.name in leave_out:
@@ -43,7 +42,7 @@ def sweep(folder, leave_out=(), chamfer=True):
     return folder
 
 
-def test_both_files_show_every_value_in_both_panels(tmp_path, capsys):
+def test_figures_show_all_values_in_light_and_dark_colours(tmp_path, capsys):
     tradeoff_figures.main([str(sweep(tmp_path / "sweep")), "-o", str(tmp_path / "out")])
     names = ("tradeoff_ladder.svg", "tradeoff_surface.svg")
     assert capsys.readouterr().out.split() == [str(tmp_path / "out" / name) for name in names]
@@ -70,7 +69,7 @@ def test_both_files_show_every_value_in_both_panels(tmp_path, capsys):
     assert set(re.findall(r"var\(--(\w+)", shown)) == set(tradeoff_figures.DARK)
 
 
-def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them():
+def test_shared_defaults_are_one_point_and_the_frontier_is_common():
     def row(parameter, value, seconds, error, default=False):
         return {
             "parameter": parameter,
@@ -118,7 +117,7 @@ def test_the_shared_default_is_one_point_and_the_frontier_is_that_of_all_of_them
         ),
     ],
 )
-def test_what_is_no_whole_sweep_is_refused_and_nothing_is_written(made, said, tmp_path):
+def test_incomplete_sweeps_are_refused_and_nothing_is_written(made, said, tmp_path):
     made(tmp_path / "sweep")
     with pytest.raises(SystemExit, match=said) as leaving:
         tradeoff_figures.main([str(tmp_path / "sweep"), "-o", str(tmp_path / "out")])

@@ -1,4 +1,4 @@
-"""What a sweep says of its rows: the frontier, when a step pays, the sentences, and panels of few points."""
+"""Evaluation of a sweep: the frontier, worthwhile steps, sentences, and panels with few points."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_step_pays_if_the_error_falls_with_the_root_of_the_time():
     assert pays(row("a", 1.0, 1.0), row("b", 99.0, 0.0), "depth_percent")
 
 
-def test_the_sentences_follow_the_rule():
+def test_verdict_sentences_follow_the_rule():
     said = verdict(parameter("affine", "exact"), [row("affine", 1.0, 1.0), row("exact", 1.18, 0.8)])
     assert said["sentence"] == (
         "Ray model: exact costs 1.18x the time of affine and removes 20 % of the depth error (1 to 0.8 %): worth it."
@@ -85,14 +85,14 @@ def test_the_sentences_follow_the_rule():
     assert verdict(parameter("a", "b"), [])["error"] is None
 
 
-def test_what_only_some_rows_have_does_not_decide():
+def test_errors_missing_in_some_rows_do_not_decide():
     each = Parameter("x", "x", "train", (Value("a"), Value("b")), "a", ("chamfer_percent", "photo_percent"))
     rows = [row("a", 1.0, math.nan, "chamfer_percent"), row("b", 2.0, 1.0, "chamfer_percent")]
     rows[0]["photo_percent"], rows[1]["photo_percent"] = 2.0, 1.0
     assert verdict(each, rows)["error"] == "photo_percent"
 
 
-def test_an_error_of_zero_and_a_single_point_can_be_drawn():
+def test_zero_errors_and_single_points_can_be_plotted():
     for rows in ([row("a", 1.0, 0.0)], [row("a", 1.0, 0.0), row("b", 1e-6, 3.0)]):
         panel = tradeoff_page.panel([each | {"frontier": True} for each in rows], "depth_percent")
         assert [point.name for point in panel.points] == [each["value"] for each in rows]

@@ -1,5 +1,4 @@
-"""The parameters that a sweep goes over: each is complete, its default is that of the options, and every value sets
-something that is allowed."""
+"""Parameters of sweeps: the registry is complete, defaults agree with the options, and all values are valid."""
 
 from __future__ import annotations
 
@@ -42,7 +41,7 @@ def test_the_registry_is_complete():
     assert len(set(shown)) == len(shown), "two values that are not the default set the same"
 
 
-def test_defaults_of_the_registry_are_those_of_the_options():
+def test_defaults_of_the_registry_agree_with_the_options():
     rays = PARAMETERS["rays"]
     assert settings(rays, parameters.value_named(rays, "exact")) == parameters.RENDER_DEFAULTS
     options = TrainOptions()
