@@ -1,4 +1,4 @@
-"""Votes of rays for the tetrahedra that they cross, against every ray clipped by every tetrahedron."""
+"""Votes of rays for tetrahedra that they cross, compared with clipping every ray by every tetrahedron."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def triangulated(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def random_points(seed: int, count: int = 60) -> np.ndarray:
-    """With the origin among them, first."""
+    """Random points, of which the first is the origin."""
     return np.concatenate([np.zeros((1, 3)), np.random.default_rng(seed).normal(size=(count, 3))])
 
 
@@ -49,7 +49,7 @@ def by_definition(points, corner, start, rays, empty, full) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("empty", "full"), [(0.98, 1.02), (0.95, 0.0), (0.3, 3.0), (3.0, 0.4)])
-def test_rays_vote_for_what_they_cross(seed, empty, full):
+def test_votes_agree_with_clipping_every_ray(seed, empty, full):
     """Rays to places near other points and between them; some end outside of the hull."""
     points, corner, neighbor = triangulated(random_points(seed))
     rng = np.random.default_rng(100 + seed)
@@ -60,7 +60,7 @@ def test_rays_vote_for_what_they_cross(seed, empty, full):
     assert votes.max() > 0 and (votes.min() < 0) == (full > empty)
 
 
-def test_votes_are_added_and_no_number_of_threads_changes_them():
+def test_votes_are_added_and_do_not_depend_on_threads():
     points, corner, neighbor = triangulated(random_points(7, 3000))
     rays = np.random.default_rng(1).normal(size=(5000, 3))
     of_all = []
@@ -76,9 +76,9 @@ def test_votes_are_added_and_no_number_of_threads_changes_them():
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-12, 1e-6])
-def test_flat_cells_end_every_walk(jitter):
-    """Points of a grid, whose triangulation has cells without volume: every walk ends; with a little jitter, as points
-    have, none is lost in them."""
+def test_walks_through_flat_cells_end(jitter):
+    """The triangulation of grid points has cells without volume. With a little jitter, as in real points, no walk is
+    lost in them."""
     grid = np.stack(np.meshgrid(*3 * [np.arange(-3.0, 4.0)], indexing="ij"), axis=-1).reshape(-1, 3)
     points = grid + jitter * np.random.default_rng(0).normal(size=grid.shape)
     cells = Delaunay(points)
@@ -90,7 +90,7 @@ def test_flat_cells_end_every_walk(jitter):
     assert np.abs(votes).sum() > 0 and (jitter == 0 or votes[:-1].sum() > len(rays))
 
 
-def test_a_point_that_is_no_corner_has_no_votes_and_what_does_not_fit_is_refused():
+def test_unused_start_points_give_no_votes_and_invalid_arrays_are_refused():
     points, corner, neighbor = triangulated(random_points(3))
     alone = np.concatenate([points, [[9.0, 9.0, 9.0]]])
     votes = np.zeros(len(corner) + 1, np.int64)

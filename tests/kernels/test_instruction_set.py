@@ -1,4 +1,4 @@
-"""The instruction set that LINPRIM_GEO_ISA asks for: what this processor has is taken, anything else is refused."""
+"""The instruction set chosen by LINPRIM_GEO_ISA: available ones are used, others are refused."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def run(wanted: str | None, *words: str) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def used() -> dict[str, tuple[str, float]]:
-    """{what was asked for: (the instruction set that was used, the opacity of a pixel)}."""
+    """{chosen name: (instruction set that is used, opacity of a pixel)}."""
     if sys.platform == "win32":
         pytest.skip("processes are copied by fork")
     done = run(None, "-c", PROGRAM, *KERNELS, "best")
@@ -48,17 +48,17 @@ def used() -> dict[str, tuple[str, float]]:
 
 
 @pytest.mark.parametrize("name", KERNELS)
-def test_every_one_of_this_processor_can_be_forced(name, used):
+def test_every_available_instruction_set_can_be_chosen(name, used):
     # The middle ray crosses a length of 1.4 at a density of 0.5.
     assert used[name] == (name, pytest.approx(1 - 2.718281828 ** (-0.7), abs=2e-6))
 
 
-def test_without_a_choice_it_is_the_best(used):
+def test_the_best_instruction_set_is_the_default(used):
     assert used["best"][0] == KERNELS[-1]
 
 
 @pytest.mark.parametrize("wanted", ["v9", ""])
-def test_one_that_is_not_there_is_one_sentence(wanted):
+def test_unavailable_instruction_sets_are_refused(wanted):
     done = run(wanted, "-m", "linprim_geo", "train", "capture")
     assert done.returncode == 1 and done.stdout == "" and done.stderr.count("\n") == 1
     assert done.stderr.startswith(

@@ -111,7 +111,7 @@ def assert_alike(leaves, view, options, geometry, value: float, gradient: float,
 @pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 @pytest.mark.parametrize("geometry", [False, True], ids=["colour", "geometry"])
 @pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
-def test_double_precision_equals_the_twin(variant, geometry, screen_filter):
+def test_double_precision_agrees_with_the_reference(variant, geometry, screen_filter):
     for seed in range(4):
         leaves, view, options = scene_of(100 + seed, variant)
         twin = twin_of(100 + seed, variant, screen_filter)
@@ -120,7 +120,7 @@ def test_double_precision_equals_the_twin(variant, geometry, screen_filter):
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
 @pytest.mark.parametrize("isa", KERNELS)
-def test_single_precision_is_near_the_twin(variant, isa):
+def test_single_precision_is_near_the_reference(variant, isa):
     with kernels(isa):
         for seed in range(2):
             leaves, view, options = scene_of(200 + seed, variant, dtype=torch.float32)
@@ -128,8 +128,8 @@ def test_single_precision_is_near_the_twin(variant, isa):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=NAMES)
-def test_largest_weights_and_counted_pixels_equal_the_twin(variant):
-    """Over several tiles and parts of blocks, and with rays that stop."""
+def test_largest_weights_and_pixel_counts_agree_with_the_reference(variant):
+    """Images have several tiles and incomplete blocks, and some rays stop early."""
     most, stop = 0.0, 0.05
     for seed in range(2):
         leaves, view, options = scene_of(300 + seed, variant, size=(37, 29))
@@ -168,8 +168,8 @@ def beside_the_view(primitive: str, count: int, least: float, size: float):
 
 
 @pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
-def test_affine_rays_keep_beside_the_view_what_is_there(primitive):
-    """The Jacobian of a centre far to the side would stretch its primitive over the whole image."""
+def test_affine_rays_do_not_stretch_primitives_beside_the_view(primitive):
+    """With the Jacobian at a centre far to the side, a primitive would cover the whole image."""
     leaves, view = beside_the_view(primitive, 80, 3.0, 0.3)
     exact, affine = (
         ops.rasterize(*[p.detach() for p in leaves], view, primitive=primitive, ray_model=model).opacity
@@ -182,7 +182,7 @@ def test_affine_rays_keep_beside_the_view_what_is_there(primitive):
 @pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
 @pytest.mark.parametrize("order", ["center", "entry", "overlap"])
 @pytest.mark.parametrize("screen_filter", [0.0, 0.7], ids=["plain", "filtered"])
-def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, order, screen_filter):
+def test_affine_rays_with_centres_outside_the_image_agree_with_the_reference(primitive, order, screen_filter):
     leaves, view = beside_the_view(primitive, 40, 1.1, 0.8)
     options = dict(primitive=primitive, ray_model="affine", order=order, stop=0.0, screen_filter=screen_filter)
     assert ops.rasterize(*[p.detach() for p in leaves], view, **options).opacity.mean() > 0.2
@@ -190,9 +190,8 @@ def test_affine_rays_of_a_centre_outside_of_the_image_equal_the_twin(primitive, 
 
 
 @pytest.mark.parametrize("variant", [variant for variant in VARIANTS if variant[1] == "affine"], ids="-".join)
-def test_an_image_cut_out_of_another_shows_the_same(variant):
-    """The part of an image far from the principal point: what is in view there is not drawn as if it were far
-    outside."""
+def test_a_crop_far_from_the_principal_point_equals_the_full_image(variant):
+    """Primitives inside a crop far from the principal point must not be treated as far outside of the image."""
     primitive, ray_model, order = variant
     rng = np.random.default_rng(4)
     whole = camera(61, 13, 40.0)
@@ -209,7 +208,7 @@ def test_an_image_cut_out_of_another_shows_the_same(variant):
 
 
 @pytest.mark.parametrize("opacity", [1.0, 0.7])
-def test_an_alpha_at_its_limit_has_no_gradient(opacity):
+def test_a_clamped_alpha_has_no_gradient(opacity):
     """One Gaussian of standard deviation 1 over one pixel, 0.1 from its middle: alpha is min(0.99, opacity exp(-0.1^2 /
     2)), and at 0.99 it moves with neither opacity nor place."""
     view = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))

@@ -1,4 +1,4 @@
-"""The depth at which a ray's transmittance falls to a level, overlaps included."""
+"""Depth at which the transmittance of a ray falls to a level, with exact overlap."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def overlap_depth(scene, view, near, level):
 
 
 @pytest.mark.parametrize("seed,depth,near,level", [(91, 3.0, 0.01, 0.5), (92, 0.5, 0.2, 0.8), (93, 2.0, 0.01, 0.05)])
-def test_level_depth_equals_the_sum_of_the_twins_intervals(seed, depth, near, level):
+def test_level_depth_agrees_with_the_reference_intervals(seed, depth, near, level):
     scene, view = random_scene(seed, 25, 1, 21, 18, depth)
     for dtype, isa in BUILDS:
         inputs = [p.to(getattr(torch, dtype)) for p in scene]
@@ -67,7 +67,7 @@ def test_impossible_levels_are_refused(level):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_level_depth_keeps_its_digits_before_a_far_background(isa):
+def test_level_depth_is_accurate_in_front_of_a_far_background(isa):
     near = ([0.0, 0.0, 3.0], 2.0, 1.0)
     results = []
     for far in (None, 1e5):
@@ -94,6 +94,6 @@ def test_level_depth_keeps_its_digits_before_a_far_background(isa):
     assert (opacity >= alone_opacity).all() and (opacity > alone_opacity).any()
 
 
-def test_no_primitives_have_no_level_depth():
+def test_level_depth_is_zero_without_primitives():
     scene = [p[:0] for p in octahedra([[0.0, 0.0, 3.0]], [[1.0, 1.0, 1.0]], [1.0])]
     assert not any(image.any() for image in ops.level_depth(*scene[:5], camera(5, 3), level=0.5))

@@ -1,4 +1,4 @@
-"""Marching cubes between voxels of several sizes: no cracks, exact planes, the same in parts."""
+"""Marching cubes with voxels of several sizes: no cracks, exact planes, equal results in parts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CUBES = 3  # of the largest blocks along an edge
 
 
 def blocks_of(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(B, 3) blocks and their (B,) levels in a cube of the largest ones, each of which is split to its level."""
+    """(B, 3) blocks and their (B,) levels in a cube of large blocks, each divided to its level."""
     index, level = [], []
     for cube in np.ndindex(levels.shape):
         parts = 2 ** (TOP - int(levels[cube]))
@@ -24,7 +24,7 @@ def blocks_of(levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def centers(index: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """(B, resolution^3, 3) middles of voxels."""
+    """(B, resolution^3, 3) centres of voxels."""
     place = np.arange(RESOLUTION) + 0.5
     z, y, x = np.meshgrid(place, place, place, indexing="ij")
     cells = np.stack([x, y, z], -1).reshape(-1, 3)
@@ -39,7 +39,7 @@ def marched(index, level, distance, known=None, owned=None):
 
 
 def random_levels(seed: int) -> np.ndarray:
-    """Of cubes that touch, levels differ by one at most."""
+    """Random levels that differ by at most one between adjacent cubes."""
     levels = np.random.default_rng(seed).integers(0, TOP + 1, (CUBES, CUBES, CUBES))
     return np.minimum(levels, minimum_filter(levels, 3, mode="nearest") + 1)
 
@@ -52,7 +52,7 @@ def directed_edges(faces: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_noise_between_voxels_of_any_size_has_no_crack(seed):
+def test_noise_in_voxels_of_mixed_sizes_has_no_cracks(seed):
     index, level = blocks_of(random_levels(seed))
     distance = np.random.default_rng(seed).standard_normal((len(index), RESOLUTION**3))
     vertices, faces = marched(index, level, distance)
@@ -82,7 +82,7 @@ def test_a_plane_is_exact_and_faces_outwards(seed):
     assert (across @ normal >= -1e-4).all() and (across @ normal).sum() > SIZE**2
 
 
-def test_a_ball_is_closed_and_as_exact_as_its_voxels_are_small():
+def test_a_ball_is_closed_with_quadratic_error_in_voxel_size():
     errors = {}
     for size in range(TOP + 1):
         index, level = blocks_of(np.full((CUBES, CUBES, CUBES), size))
@@ -97,7 +97,7 @@ def test_a_ball_is_closed_and_as_exact_as_its_voxels_are_small():
     assert errors[0] < errors[1] / 3 < errors[2] / 9
 
 
-def test_voxels_of_one_size_have_a_vertex_wherever_neighbours_differ():
+def test_vertices_of_uniform_voxels_agree_with_linear_interpolation():
     index, level = blocks_of(np.zeros((CUBES, CUBES, CUBES), int))
     distance = np.random.default_rng(0).standard_normal((len(index), RESOLUTION**3))
     vertices = marched(index, level, distance)[0]
@@ -117,7 +117,7 @@ def test_voxels_of_one_size_have_a_vertex_wherever_neighbours_differ():
     assert np.abs(wanted[order] - vertices[found]).max() < 1e-5
 
 
-def test_parts_are_together_the_whole():
+def test_parts_have_the_same_faces_as_the_whole():
     index, level = blocks_of(random_levels(1))
     distance = np.sin(centers(index, level) / 4).sum(2)
     part = np.random.default_rng(0).integers(0, 3, len(index))
@@ -131,8 +131,8 @@ def test_parts_are_together_the_whole():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_blocks_before_the_origin_are_like_those_behind_it(seed):
-    """Moved by two of the largest blocks, so that some lie on either side of it."""
+def test_negative_block_indices_give_the_same_surface(seed):
+    """Blocks are moved by two large blocks, so that they lie on both sides of the origin."""
     index, level = blocks_of(random_levels(seed))
     distance = np.random.default_rng(seed).standard_normal((len(index), RESOLUTION**3))
     vertices, faces = marched(index, level, distance)
@@ -141,7 +141,7 @@ def test_blocks_before_the_origin_are_like_those_behind_it(seed):
     np.testing.assert_allclose(moved, vertices - 2 * RESOLUTION * 2**TOP, rtol=0, atol=1e-12)
 
 
-def test_there_is_no_surface_beside_unknown_voxels():
+def test_unknown_voxels_give_no_surface():
     index, level = blocks_of(random_levels(2))
     place = centers(index, level)
     distance = place[..., 2] - SIZE / 2 - 0.3
@@ -161,7 +161,7 @@ def test_there_is_no_surface_beside_unknown_voxels():
         ({"known": np.ones((2, RESOLUTION**3), np.uint8)}, "known"),
     ],
 )
-def test_what_does_not_fit_is_refused(change, sentence):
+def test_invalid_arrays_are_refused(change, sentence):
     given = {
         "index": np.zeros((1, 3), np.int64),
         "level": np.zeros(1, np.int64),

@@ -1,4 +1,4 @@
-"""The sparse Adam step against torch.optim.Adam, one optimiser per row, that steps only when the row is touched."""
+"""The sparse Adam step, compared with one torch.optim.Adam per row that steps only when the row is touched."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class State:
 
 
 def gradients_of(n, touched, seed):
-    """Gradients over seven orders of magnitude, 0 in the rows that are not touched."""
+    """Gradients over seven orders of magnitude, zero in untouched rows."""
     rng = torch.Generator().manual_seed(seed)
     sizes = [torch.randn(n, *s, generator=rng) * 10 ** (7 * torch.rand(n, *s, generator=rng) - 5) for s in SHAPES]
     return [g * touched.reshape(-1, *[1] * (g.dim() - 1)) for g in sizes]
@@ -57,7 +57,7 @@ def rows_drawn(n, share, seed):
 
 @pytest.mark.parametrize("isa", KERNELS)
 @pytest.mark.parametrize("given", [True, False])
-def test_each_row_goes_through_the_adam_of_its_own_steps(given, isa):
+def test_each_row_agrees_with_torch_adam_for_its_steps(given, isa):
     n, rounds = 9, 25
     state = State(n)
     rows = [[torch.nn.Parameter(v[i].double()) for v in state.values] for i in range(n)]
@@ -89,7 +89,7 @@ def test_each_row_goes_through_the_adam_of_its_own_steps(given, isa):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_with_every_row_touched_it_is_the_dense_step(isa):
+def test_touching_all_rows_equals_the_dense_step(isa):
     n = 700
     state, dense = State(n, 1), State(n, 1)
     with kernels(isa):
@@ -103,7 +103,7 @@ def test_with_every_row_touched_it_is_the_dense_step(isa):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_untouched_rows_keep_every_bit(isa):
+def test_untouched_rows_are_unchanged(isa):
     n = 1300  # three tasks
     state = State(n, 2)
     with kernels(isa):
@@ -121,7 +121,7 @@ def test_untouched_rows_keep_every_bit(isa):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_a_row_is_touched_by_any_gradient_that_is_not_zero(isa):
+def test_any_nonzero_gradient_touches_a_row(isa):
     n = len(SHAPES) + 2
     state = State(n, 3)
     gradients = [torch.zeros_like(v) for v in state.values]
@@ -162,7 +162,7 @@ def test_long_histories_are_corrected_exactly(isa):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_it_does_not_depend_on_threads(isa):
+def test_results_do_not_depend_on_threads(isa):
     n = 2100
     results = []
     for count in (1, 2, 3, 7):
@@ -176,12 +176,12 @@ def test_it_does_not_depend_on_threads(isa):
         assert_identical(results[0], other)
 
 
-def test_no_rows_and_no_tensors_are_no_work():
+def test_empty_input_is_accepted():
     State(0).advance([torch.zeros(0, *shape) for shape in SHAPES])
     adam_rows([], [], [], [], [], torch.zeros(3, dtype=torch.int32))
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_tensors_are_refused():
     def tensors(*shape):
         return [torch.zeros(*shape)]
 

@@ -1,4 +1,4 @@
-"""The core gives bitwise the same at any number of threads, from any number of callers, and every time."""
+"""Results of the core are bitwise equal for any number of threads and concurrent callers."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_zero_threads_are_one_per_core():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_callers_in_several_threads_do_not_disturb_each_other(dtype):
+def test_concurrent_callers_get_the_same_results(dtype):
     ops.set_threads(2)
     work = []
     for k in range(4):
@@ -109,7 +109,7 @@ def test_callers_in_several_threads_do_not_disturb_each_other(dtype):
                 assert_identical(got, expected)
 
 
-def test_both_precisions_at_once():
+def test_concurrent_calls_in_both_precisions_get_the_same_results():
     ops.set_threads(2)
     scene, view = random_scene(20, 60, 1, 70, 50)
     work = [[p.to(dtype) for p in scene] for dtype in (torch.float32, torch.float64)] * 3
@@ -138,5 +138,5 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-def test_a_forked_child_has_threads_of_its_own():
+def test_the_thread_pool_works_in_a_forked_child():
     subprocess.run([sys.executable, "-c", FORK], check=True, timeout=60)

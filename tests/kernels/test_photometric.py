@@ -1,4 +1,4 @@
-"""The compiled image loss and Adam step against their twins: torch in double, and torch.optim.Adam."""
+"""The compiled image loss and Adam step, compared with float64 torch and torch.optim.Adam."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ SIZES = [(1, 1), (1, 50), (50, 1), (3, 4), (10, 10), (11, 11), (12, 37), (64, 48
 
 @pytest.mark.parametrize("isa", KERNELS)
 @pytest.mark.parametrize("size", SIZES)
-def test_loss_and_gradient_equal_the_twin(size, isa):
+def test_loss_and_gradient_agree_with_the_reference(size, isa):
     a, b, weight = images(*size)
     with kernels(isa):
         for share in (0.0, 0.2, 1.0):
@@ -73,7 +73,7 @@ def test_loss_and_gradient_equal_the_twin(size, isa):
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_the_parts_are_what_they_are_called(isa):
+def test_parts_of_the_loss_agree_with_their_definitions(isa):
     a, b, weight = images(40, 31, 1)
     with kernels(isa):
         for w in (None, weight):
@@ -110,7 +110,7 @@ def test_equal_images_have_no_loss_and_no_gradient():
         assert inputs.grad.abs().max() < 20 * EPS / 9e-4 / (3 * 30 * 20)
 
 
-def test_the_gradient_is_scaled_and_may_be_asked_for_again():
+def test_backward_can_be_repeated_and_scaled():
     a, b, _ = images(20, 13, 3)
     inputs = a.clone().requires_grad_()
     loss = ops.photometric_loss(inputs, b)[0]
@@ -125,7 +125,7 @@ def test_the_gradient_is_scaled_and_may_be_asked_for_again():
     torch.testing.assert_close(plus, first + b, rtol=1e-6, atol=1e-7)
 
 
-def test_gradient_by_finite_differences():
+def test_gradient_agrees_with_finite_differences():
     # In float32 a difference over a step h is good to EPS / h of the loss; the loss is smooth but for the L1 kinks,
     # which lie far off.
     a, b, weight = images(9, 8, 4)
@@ -142,7 +142,7 @@ def test_gradient_by_finite_differences():
     )
 
 
-def test_layout_does_not_matter_and_inputs_stay():
+def test_non_contiguous_inputs_give_the_same_result_and_stay_unchanged():
     a, b, weight = images(21, 16, 6)
     wanted = ops.photometric_loss(a, b, 0.2, weight)
     twisted = [t.transpose(-1, -2).contiguous().transpose(-1, -2) for t in (a, b, weight)]
@@ -164,7 +164,7 @@ def test_the_operator_is_registered_correctly(weighted):
     torch.library.opcheck(torch.ops.linprim_geo.photometric_loss.default, args)
 
 
-def test_wrong_shapes_are_named():
+def test_wrong_shapes_are_refused_by_name():
     a, b, weight = images(9, 8, 8)
     cases = {
         "target": (a, b[:, :-1]),

@@ -1,4 +1,4 @@
-"""Where points lie in images, and how many views look at them, against numpy."""
+"""Projection of points into views, and counts of views that see them, compared with numpy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def visible(camera: Camera):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_places_in_the_image(threads):
+def test_visible_points_agree_with_numpy(threads):
     ops.set_threads(threads)
     for camera in cameras():
         pixels, depth = camera.project(points())
@@ -43,21 +43,21 @@ def test_places_in_the_image(threads):
         np.testing.assert_allclose(along, depth[inside], rtol=1e-12)
 
 
-def test_the_border_belongs_to_the_image_at_its_first_column_and_row_alone():
+def test_the_image_includes_its_first_but_not_its_last_border():
     camera = Camera(8, 6, 1.0, 1.0, 0.0, 0.0, np.eye(4))
     corners = np.array([[0, 0, 1], [8, 0, 1], [0, 6, 1], [7.75, 5.75, 1], [0, 0, 0], [0, 0, -1]], float)
     pose, lens = camera.pinhole()
     assert surface_ops.visible_points(pose, lens, 8, 6, corners)[0].tolist() == [1, 0, 0, 1, 0, 0]
 
 
-def test_no_points_are_nowhere():
+def test_no_points_give_empty_results():
     pose, lens = cameras()[0].pinhole()
     inside, place, depth = surface_ops.visible_points(pose, lens, 60, 40, np.zeros((0, 3)))
     assert inside.shape == (0,) and place.shape == (0, 2) and depth.shape == (0,)
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_views_that_look_at_points_and_know_them(threads):
+def test_count_looking_views_agrees_with_numpy(threads):
     ops.set_threads(threads)
     views, looking, knowing = [], np.zeros(COUNT, int), np.zeros(COUNT, int)
     for camera in cameras():
@@ -75,7 +75,7 @@ def test_views_that_look_at_points_and_know_them(threads):
     np.testing.assert_array_equal(found[1], knowing)
 
 
-def test_shapes_that_do_not_fit_are_refused():
+def test_wrong_shapes_are_refused():
     pose, lens = cameras()[0].pinhole()
     with pytest.raises(ValueError, match="point has shape"):
         surface_ops.visible_points(pose, lens, 60, 40, np.zeros((3, 2)))

@@ -1,4 +1,4 @@
-"""The compiled rasterizer against its float64 twin, on ordinary and on hard scenes."""
+"""The compiled rasterizer, compared with the float64 reference on ordinary and hard scenes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def expectation(make, *args):
 
 
 def scales(images) -> dict[str, float]:
-    """The range that the error of an image is relative to."""
+    """The ranges to which errors of images are relative."""
     depth = max(1.0, float(images["depth_first"].max()) + float(images["depth_expected"].abs().max()))
     return {name: {"distortion": depth**2}.get(name, depth if name.startswith("depth") else 1.0) for name in IMAGES}
 
@@ -112,7 +112,7 @@ def ordinary(case, dtype):
 
 @pytest.mark.parametrize("case", range(8))
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_equals_the_twin(case, dtype):
+def test_ordinary_scenes_agree_with_the_reference(case, dtype):
     for isa in ["scalar"] if dtype == torch.float64 else KERNELS:
         images = assert_like_twin(ordinary, case, dtype, isa=isa, each=dtype == torch.float64)
         assert (images["pixels"] > 0).sum() >= 3 and (images["opacity"] > 0.3).any()
@@ -266,7 +266,7 @@ def hard(name, dtype):
 
 
 @pytest.mark.parametrize("name", HARD)
-def test_hard_cases_equal_the_twin(name):
+def test_hard_cases_agree_with_the_reference(name):
     value, gradient = HARD[name][-2:]
     for dtype, isa in BUILDS:
         images = assert_like_twin(
@@ -277,13 +277,13 @@ def test_hard_cases_equal_the_twin(name):
 
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_principal_point_far_outside_the_image(dtype, isa):
+def test_accuracy_with_a_principal_point_far_outside_the_image(dtype, isa):
     # 320 pixels from the reference to the tile, not 16.
     images = assert_like_twin(far_off_center, getattr(torch, dtype), isa=isa, value=20 * VALUE, gradient=20 * GRADIENT)
     assert images["opacity"].max() > 0.3
 
 
-def test_a_million_units_from_the_origin():
+def test_accuracy_a_million_units_from_the_origin():
     # Both subtract the same 1e6 from sums of three products: each loses up to 3e6 eps of position, and half-axes are a
     # tenth.
     images = assert_like_twin(far_away, torch.float64, value=6e7, gradient=6e8)
@@ -309,7 +309,7 @@ def test_edge_on_faces_move_by_two_parts_in_a_million(gap):
     assert int((off > bound).sum()) <= 1
 
 
-def test_order_is_that_of_the_centres_and_ties_keep_their_index():
+def test_primitives_are_ordered_by_centre_and_ties_by_index():
     scene, view = random_scene(31, 6, 1)
     pose = view.world_to_camera
     local = scene[0].numpy() @ pose[:3, :3].T + pose[:3, 3]
@@ -334,7 +334,7 @@ def test_double_orders_depths_that_a_float_cannot_tell_apart():
 
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_half_axes_that_are_not_positive_are_not_drawn(dtype, isa):
+def test_primitives_with_non_positive_half_axes_are_not_drawn(dtype, isa):
     scene, view = random_scene(41, 9, 4)
     scene = [p.to(getattr(torch, dtype)) for p in scene]
     keep = torch.tensor([0, 2, 3, 5, 6, 8])
@@ -374,7 +374,7 @@ def test_a_zero_quaternion_is_no_rotation(dtype, isa):
 
 @pytest.mark.parametrize("geometry", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_primitives(dtype, geometry):
+def test_no_primitives_give_the_background(dtype, geometry):
     scene = [p.to(dtype) for p in hard("nothing", dtype)[0]]
     inputs, view = leaves(scene), camera(5, 3)
     out = ops.rasterize(*inputs, view, geometry=geometry)

@@ -1,5 +1,4 @@
-"""Gradients of the compiled rasterizer by differences, its operators, and what the backward pass keeps of the
-forward."""
+"""Gradients of the compiled rasterizer by finite differences, its operators, and state between its passes."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 
 @pytest.mark.parametrize("geometry", [False, True])
 @pytest.mark.parametrize("seed,coefficients,depth", [(51, 4, 3.0), (52, 1, 0.5), (53, 16, 2.5)])
-def test_gradients_by_finite_differences(seed, coefficients, depth, geometry):
+def test_gradients_agree_with_finite_differences(seed, coefficients, depth, geometry):
     # Six pixels and three primitives; seeds whose rays keep clear of edges by more than the step.
     scene, view = random_scene(seed, 3, coefficients, 3, 2, depth, spread=0.3)
     inputs = leaves(scene)
@@ -85,7 +84,7 @@ def test_gradient_of_each_input_alone_equals_that_of_all():
 
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_weights_of_the_adjoint_are_those_of_the_forward_pass_bit_by_bit(dtype, isa):
+def test_weights_of_backward_and_forward_pass_are_bitwise_equal(dtype, isa):
     # One pixel at a time, no sum is rounded: the gradient to a primitive's coefficient of degree 0 is C0 times its
     # weight, and `max_weight` is that weight. It is 0 exactly where the forward pass did not hit.
     met = 0
@@ -103,7 +102,7 @@ def test_weights_of_the_adjoint_are_those_of_the_forward_pass_bit_by_bit(dtype, 
 
 
 @pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_colour_does_not_depend_on_whether_geometry_is_asked_for(dtype, isa):
+def test_colour_does_not_depend_on_geometry_output(dtype, isa):
     scene, view = random_scene(63, 20, 9, 33, 20)
     scene = [p.to(getattr(torch, dtype)) for p in scene]
     with kernels(isa):
@@ -125,7 +124,7 @@ def test_gradient_to_the_background_is_the_transmittance():
 
 
 @pytest.mark.parametrize("samples", [1, 3])
-def test_screen_gradient_is_that_of_moving_a_centre_by_a_pixel(samples):
+def test_screen_gradient_agrees_with_moving_a_centre(samples):
     # Degree 0: the colour does not turn with the centre. The loss's own third derivative bounds the difference
     # quotient.
     scene, view = random_scene(65, 4, 1, 25, 21, depth=4.0, spread=0.3)
@@ -150,7 +149,7 @@ def test_screen_gradient_is_that_of_moving_a_centre_by_a_pixel(samples):
             assert grad[i, axis].item() == pytest.approx(quotient.item(), rel=1e-3, abs=1e-4)
 
 
-def test_two_graphs_may_be_differentiated_in_any_order_and_twice():
+def test_two_graphs_can_be_differentiated_in_any_order_and_twice():
     first, second = (random_scene(seed, 30, 4, 40, 30) for seed in (66, 67))
     alone = [everything(*first), everything(*second)]
     inputs = [leaves(first[0]), leaves(second[0])]
@@ -164,7 +163,7 @@ def test_two_graphs_may_be_differentiated_in_any_order_and_twice():
 
 @pytest.mark.parametrize("geometry", [False, True])
 @pytest.mark.parametrize("dtype,isa", BUILDS)
-def test_gradients_do_not_depend_on_what_was_rendered_in_between(dtype, isa, geometry):
+def test_gradients_do_not_depend_on_other_renders_in_between(dtype, isa, geometry):
     scene, view = random_scene(68, 60, 4, 45, 37)
     scene = [p.to(getattr(torch, dtype)) for p in scene]
     with kernels(isa):
@@ -182,7 +181,7 @@ def test_gradients_do_not_depend_on_what_was_rendered_in_between(dtype, isa, geo
         assert_identical(gradients(images, inputs, cotangents(images)), grads)
 
 
-def test_a_list_is_taken_again_only_for_the_very_same_content():
+def test_tile_lists_are_reused_only_for_equal_inputs():
     # Every pair of scenes differs in one value of one tensor, or in one number of the view.
     scene, view = random_scene(69, 12, 4, 20, 14)
     values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
@@ -206,8 +205,8 @@ def test_a_list_is_taken_again_only_for_the_very_same_content():
 
 
 @pytest.mark.parametrize("primitive", ["octahedron", "tetrahedron"])
-def test_screen_gradient_of_what_crosses_the_near_plane_is_not_zero(primitive):
-    """It is that of a movement at the middle of the depths beyond the near plane."""
+def test_screen_gradient_of_primitives_across_the_near_plane(primitive):
+    """It is taken at the middle of the primitive's depths beyond the near plane."""
     camera = Camera(20, 16, 15.0, 16.0, 10.0, 8.0, np.eye(4))
     near, reach, arms = 0.2, 0.8, 3 if primitive == "octahedron" else 4
     center = torch.tensor([[0.05, -0.1, 0.3], [0.1, 0.05, -0.1], [0.1, 0.1, 3.0]], dtype=torch.float64)

@@ -1,5 +1,4 @@
-"""What the compiled rasterizer takes and refuses, and that nothing it returns is not finite, with primitives or none in
-view."""
+"""Input that the compiled rasterizer accepts or refuses, and finite output with or without visible primitives."""
 
 from __future__ import annotations
 
@@ -59,7 +58,7 @@ def assert_finite_everywhere(scene, view, options):
     return bool((out.pixels > 0).any())
 
 
-def test_hard_scenes_give_finite_numbers_only():
+def test_hard_scenes_give_finite_results():
     hit = 0
     others = [name for name in KERNELS if name != KERNELS[-1]]
     for seed in range(1800):
@@ -73,7 +72,7 @@ def test_hard_scenes_give_finite_numbers_only():
 
 
 @pytest.mark.parametrize("isa", KERNELS)
-def test_a_thickness_beyond_float_gives_finite_numbers(isa):
+def test_an_overflowing_thickness_gives_finite_results(isa):
     scene = [p.float() for p in octahedra([[0.01, 0.02, 3.0]], [[1.0, 1.0, 1.0]], [3e38])]
     with kernels(isa):
         out = ops.rasterize(*scene, camera(), geometry=True)
@@ -95,7 +94,7 @@ def test_a_denormal_axis_gives_finite_gradients(isa):
     assert all(bool(g.isfinite().all()) for g in grads)
 
 
-def test_the_distortion_of_a_length_of_1e12_has_a_finite_gradient():
+def test_the_gradient_of_a_distortion_above_1e12_is_finite():
     pose = np.eye(4)
     pose[:3] = [
         [0.2375, 0.9251, -0.2964, 0.4593],
@@ -128,7 +127,7 @@ def assert_finite(parameters, view, options) -> bool:
 
 
 @ladder(LADDER, DTYPES)
-def test_no_primitive_and_one_in_images_of_any_shape(variant, dtype):
+def test_zero_and_one_primitive_in_images_of_any_shape(variant, dtype):
     options = options_of(variant)
     for (width, height), count in itertools.product(((1, 1), (1, 5000), (5000, 1)), (0, 1)):
         focal = max(4.0, 0.8 * max(width, height))
@@ -142,7 +141,7 @@ def test_no_primitive_and_one_in_images_of_any_shape(variant, dtype):
 
 
 @ladder(LADDER, DTYPES)
-def test_nothing_in_view_leaves_the_background_and_no_gradient(variant, dtype):
+def test_primitives_out_of_view_give_background_and_zero_gradients(variant, dtype):
     options = options_of(variant)
     parameters, view = scene_of(variant, 6, 4)
     pose = view.world_to_camera.copy()
@@ -161,7 +160,7 @@ def test_nothing_in_view_leaves_the_background_and_no_gradient(variant, dtype):
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", NAMES)
-def test_an_input_that_is_not_finite_is_named_with_its_row(name, bad):
+def test_non_finite_inputs_are_refused_with_their_row(name, bad):
     scene, view = random_scene(81, 5, 4)
     tensor = scene[NAMES.index(name)]
     row = 2
@@ -171,7 +170,7 @@ def test_an_input_that_is_not_finite_is_named_with_its_row(name, bad):
 
 
 @ladder(LADDER, DTYPES)
-def test_what_is_not_finite_is_refused_with_its_tensor_and_row(variant, dtype):
+def test_non_finite_inputs_of_every_variant_are_refused_with_their_row(variant, dtype):
     options = options_of(variant)
     for name, bad in itertools.product(NAMES, (math.nan, math.inf, -math.inf)):
         parameters, view = scene_of(variant, 81, 5, 4)
@@ -183,7 +182,7 @@ def test_what_is_not_finite_is_refused_with_its_tensor_and_row(variant, dtype):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_wrong_shape_is_named(name):
+def test_wrong_shapes_are_refused_by_name(name):
     scene, view = random_scene(82, 5, 4)
     i = NAMES.index(name)
     scene[i] = scene[i][..., :-1]
@@ -232,7 +231,7 @@ def test_impossible_cameras_are_refused(change):
 @pytest.mark.parametrize(
     "change", [{"cx": float("nan")}, {"world_to_camera": np.full((4, 4), np.nan)}, {"fx": float("inf")}]
 )
-def test_cameras_that_are_not_finite_are_refused(change):
+def test_non_finite_cameras_are_refused(change):
     scene, view = random_scene(86, 5, 4)
     values = {k: getattr(view, k) for k in ("width", "height", "fx", "fy", "cx", "cy", "world_to_camera")}
     with pytest.raises((LinprimError, ValueError)):
@@ -240,7 +239,7 @@ def test_cameras_that_are_not_finite_are_refused(change):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_inputs_of_any_layout_give_the_same_and_stay_as_they_are(dtype):
+def test_non_contiguous_inputs_give_the_same_result_and_stay_unchanged(dtype):
     scene, view = random_scene(87, 7, 9, 20, 14)
     scene = [p.to(dtype) for p in scene]
     wanted = everything(scene, view)
@@ -258,7 +257,7 @@ def test_inputs_of_any_layout_give_the_same_and_stay_as_they_are(dtype):
         assert_identical(layout, before)
 
 
-def test_gradients_that_are_not_contiguous_are_read_right():
+def test_non_contiguous_output_gradients_are_accepted():
     scene, view = random_scene(88, 7, 1, 20, 14)
     inputs = leaves(scene)
     out = ops.rasterize(*inputs, view)

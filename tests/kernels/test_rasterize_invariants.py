@@ -1,5 +1,4 @@
-"""What changes no image of the compiled rasterizer, or by no more than rounding: rigid motions, units, the order of the
-input, copies, threads."""
+"""Invariances of the compiled rasterizer up to rounding: rigid motion, unit of length, order, copies, threads."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from linprim_geo.kernels.reference import rasterize as reference
 pytestmark = pytest.mark.usefixtures("few_threads")
 
 
-def test_a_rigid_motion_and_a_change_of_unit_change_nothing():
+def test_images_are_invariant_to_rigid_motion_with_scaling():
     scene, view = random_scene(73, 12, 1, 20, 15)
     wanted = ops.rasterize(*scene, view, geometry=True)
     rng = np.random.default_rng(1)
@@ -50,7 +49,7 @@ def test_a_rigid_motion_and_a_change_of_unit_change_nothing():
         torch.testing.assert_close(getattr(got, name), unit * getattr(wanted, name), rtol=1e-9, atol=1e-9 * unit)
 
 
-def test_a_part_of_an_image_is_the_image_of_that_part():
+def test_crops_equal_parts_of_the_full_image():
     # Tiles, blocks and bounds fall elsewhere; the rays are the same.
     scene, view = random_scene(74, 40, 4, 50, 41)
     whole = ops.rasterize(*scene, view, geometry=True)
@@ -92,7 +91,7 @@ def assert_near(variant, got, wanted, units, eps: float, names=IMAGES):
 @given(seeds, st.floats(-3, 3))
 @PROPERTY
 @ladder(LADDER)
-def test_a_rigid_motion_of_scene_and_camera_changes_nothing(variant, seed, distance):
+def test_images_are_invariant_to_rigid_motion(variant, seed, distance):
     options = options_of(variant)
     parameters, view = scene_of(variant, seed)
     rng = np.random.default_rng(seed)
@@ -113,7 +112,7 @@ def test_a_rigid_motion_of_scene_and_camera_changes_nothing(variant, seed, dista
 @given(seeds, st.floats(-6, 6))
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_a_change_of_unit_changes_nothing(variant, dtype, seed, exponent):
+def test_images_are_invariant_to_the_unit_of_length(variant, dtype, seed, exponent):
     options = options_of(variant)
     parameters, view = scene_of(variant, seed)
     k = 2.0 ** round(exponent / math.log10(2))  # exact in both scalars
@@ -135,7 +134,7 @@ def test_a_change_of_unit_changes_nothing(variant, dtype, seed, exponent):
 @given(seeds)
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_the_order_of_the_input_is_irrelevant(variant, dtype, seed):
+def test_images_do_not_depend_on_the_order_of_primitives(variant, dtype, seed):
     options = options_of(variant)
     parameters, view = scene_of(variant, seed, 12)
     parameters = [p.to(dtype) for p in parameters]
@@ -177,7 +176,7 @@ def test_coincident_primitives_may_be_swapped_under_overlap(variant, dtype, seed
 @given(seeds, st.integers(2, 200))
 @PROPERTY
 @ladder(SOLID, DTYPES)
-def test_copies_of_a_share_of_the_density_are_the_whole(variant, dtype, seed, copies):
+def test_copies_with_a_share_of_the_density_equal_one_primitive(variant, dtype, seed, copies):
     # Thicknesses of one chord add, so a primitive of one colour may be cut into copies in every order.
     options = options_of(variant)
     parameters, view = scene_of(variant, seed, 1, width=9, height=7, depth=4.0, spread=0.2)
@@ -195,7 +194,7 @@ def test_copies_of_a_share_of_the_density_are_the_whole(variant, dtype, seed, co
 @given(seeds, st.floats(-6, 6), st.sampled_from([0.0, 1e-3, 0.3]))
 @PROPERTY
 @ladder(LADDER, DTYPES)
-def test_opacity_is_a_share_and_grows_with_density(variant, dtype, seed, exponent, stop):
+def test_opacity_is_in_0_to_1_and_grows_with_density(variant, dtype, seed, exponent, stop):
     options = options_of(variant)
     parameters, view = scene_of(variant, seed)
     parameters = [p.to(dtype) for p in parameters]
@@ -213,7 +212,7 @@ def test_opacity_is_a_share_and_grows_with_density(variant, dtype, seed, exponen
 @given(seeds, st.sampled_from([2, 3, 5]))
 @settings(PROPERTY, max_examples=3)
 @ladder(LADDER, DTYPES)
-def test_the_number_of_threads_changes_no_bit(variant, dtype, seed, threads):
+def test_results_do_not_depend_on_threads(variant, dtype, seed, threads):
     options = options_of(variant)
     parameters, view = scene_of(variant, seed, 40, width=40, height=35)
     parameters = [p.to(dtype) for p in parameters]

@@ -1,4 +1,4 @@
-"""The torch twin against closed forms, invariants, a program over triangles and sampling."""
+"""The float64 reference in torch, compared with closed forms, a program over triangles, and sampling."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def triangle_interval(center, rotation, extent, ray, near):
 
 
 def literal_render(parameters, camera, near=0.01, stop=1e-3, level=0.5):
-    """Every output of `rasterize` by the words of its definition, in numpy scalars."""
+    """Every output of `rasterize` by its definition, in numpy scalars."""
     center, quaternion, extent, density, sh, background = (p.detach().numpy() for p in parameters)
     pose = camera["world_to_camera"].numpy()
     turn, shift, height, width = pose[:3, :3], pose[:3, 3], camera["height"], camera["width"]
@@ -109,7 +109,7 @@ def literal_render(parameters, camera, near=0.01, stop=1e-3, level=0.5):
         (3, {"stop": 0.3, "level": 0.4}),
     ],
 )
-def test_equals_a_scalar_program_over_triangles(seed, more):
+def test_reference_agrees_with_a_scalar_program_over_triangles(seed, more):
     parameters, camera = random_scene(seed, 12, 9, width=11, height=8, **more)
     definition = {name: camera[name] for name in ("near", "stop", "level") if name in camera}
     result = rasterize(*parameters, **camera)
@@ -119,7 +119,7 @@ def test_equals_a_scalar_program_over_triangles(seed, more):
 
 
 @pytest.mark.parametrize("depth", [3.0, 0.3])
-def test_thickness_equals_sampled_density(depth):
+def test_thickness_agrees_with_sampled_density(depth):
     parameters, camera = random_scene(4, 6, 1, depth=depth)
     near, far, samples = 0.05, 9.0, 20_000
     result = rasterize(*parameters, **camera, near=near, stop=0.0)
@@ -134,7 +134,7 @@ def test_thickness_equals_sampled_density(depth):
     assert (error <= bound).all()
 
 
-def test_depths_equal_sampled_transmittance_where_nothing_overlaps():
+def test_depths_agree_with_sampled_transmittance_without_overlap():
     # Three in a row with gaps, so that blending by centre is blending by depth.
     parameters = octahedra(
         [[0.1, 0, 2], [0, -0.1, 4], [0.1, 0.1, 6]],
@@ -161,7 +161,7 @@ def test_depths_equal_sampled_transmittance_where_nothing_overlaps():
 # --- closed forms ---
 
 
-def test_octahedron_on_the_axis():
+def test_octahedron_on_the_axis_agrees_with_the_closed_form():
     result = rasterize(*octahedra([[0, 0, 5]], [[1.0, 1.0, 0.7]], [0.9], background=(0.2, 0.2, 0.2)), **axis_camera())
     tau, t_in = 0.9 * 2 * 0.7, 5 - 0.7
     alpha = 1 - math.exp(-tau)
@@ -180,7 +180,7 @@ def test_octahedron_on_the_axis():
             torch.testing.assert_close(image, mirrored, **EXACT)
 
 
-def test_entry_normals():
+def test_entry_normals_are_those_of_faces():
     result = rasterize(*octahedra([[0, 0, 5]], [[1.0, 0.8, 0.7]], [20.0]), **axis_camera(8, 8))
     rows, columns = (result["depth_median"] > 0).nonzero(as_tuple=True)
     assert len(rows) >= 4
@@ -192,7 +192,7 @@ def test_entry_normals():
     torch.testing.assert_close(result["normal"], result["normal_median"] * result["opacity"], **EXACT)
 
 
-def test_two_primitives_on_the_axis():
+def test_two_primitives_on_the_axis_agree_with_the_closed_form():
     parameters = octahedra([[0, 0, 8], [0, 0, 4]], [[1, 1, 1], [1, 1, 0.5]], [0.6, 0.5], color=[0.3, 0.9])
     pixel = {
         name: value[..., 4, 4] for name, value in rasterize(*parameters, **axis_camera()).items() if value.ndim > 1
@@ -205,7 +205,7 @@ def test_two_primitives_on_the_axis():
     assert pixel["distortion"].item() == pytest.approx(front * back * (z[0] - z[1]) ** 2, rel=1e-12)
 
 
-def test_distortion_keeps_its_digits_far_away():
+def test_distortion_is_accurate_at_large_depths():
     # Two in touch at a depth of 1e5: M2 - M1^2 of plain depths would be rounded to multiples of 1e-6.
     near_by, far_off = (
         rasterize(*octahedra([[0, 0, z], [0, 0, z + 2]], [[1, 1, 1]] * 2, [0.6, 0.6]), **axis_camera(1, 1))
@@ -214,7 +214,7 @@ def test_distortion_keeps_its_digits_far_away():
     assert far_off["distortion"].item() == pytest.approx(near_by["distortion"].item(), abs=1e-9)
 
 
-def test_camera_inside():
+def test_camera_inside_a_primitive():
     result = rasterize(*octahedra([[0, 0, 0.2]], [[1, 1, 1]], [0.8]), **axis_camera(near=0.1))
     assert (result["opacity"] > 0).all() and result["pixels"].item() == 81
     assert result["opacity"][4, 4].item() == pytest.approx(1 - math.exp(-0.8 * (1.2 - 0.1)), rel=1e-14)
@@ -222,7 +222,7 @@ def test_camera_inside():
     assert (result["normal"] == 0).all() and (result["normal_median"] == 0).all()
 
 
-def test_near_plane_cuts():
+def test_primitives_are_cut_by_the_near_plane():
     # The near plane cuts the body on the axis; rays further out still enter through a face and have a normal.
     result = rasterize(*octahedra([[0, 0, 2]], [[1, 1, 1]], [0.8]), **axis_camera(near=1.25))
     assert result["depth_first"][4, 4].item() == 1.25
@@ -232,7 +232,7 @@ def test_near_plane_cuts():
     assert entered.any() and (result["normal"][2][entered] < 0).all()
 
 
-def test_behind_the_camera_has_no_effect():
+def test_primitives_behind_the_camera_have_no_effect():
     parameters, camera = random_scene(5, 5, 4)
     behind, _ = random_scene(6, 3, 4)
     turn, shift = camera["world_to_camera"][:3, :3], camera["world_to_camera"][:3, 3]
@@ -247,14 +247,14 @@ def test_behind_the_camera_has_no_effect():
         assert (grad[:3] == 0).all() and (grad[3:] != 0).any()
 
 
-def test_centre_behind_the_camera_but_body_before_it():
+def test_primitives_with_centre_behind_the_camera_are_drawn():
     parameters = octahedra([[0, 0, -0.5], [0, 0, 1]], [[1, 1, 1], [1, 1, 0.5]], [0.8, 0.4], color=[0.2, 0.8])
     pixel = rasterize(*parameters, **axis_camera())["rgb"][0, 4, 4].item()
     first = 1 - math.exp(-0.8 * (0.5 - 0.01))
     assert pixel == pytest.approx(0.2 * first + 0.8 * (1 - first) * (1 - math.exp(-0.4)), rel=1e-13)
 
 
-def test_parallel_faces():
+def test_rays_parallel_to_faces():
     # v = (1, 0, 1): both faces with s = (1, ., -1) are parallel to the ray, with a slope of exactly zero.
     camera = dict(world_to_camera=torch.eye(4), fx=1.0, fy=1.0, cx=-0.5, cy=0.5, width=1, height=1)
 
@@ -268,14 +268,14 @@ def test_parallel_faces():
     assert outside["opacity"].item() == 0 and outside["pixels"].item() == 0
 
 
-def test_order_of_ties():
+def test_ties_are_ordered_by_index():
     parameters = octahedra([[0, 0, 5], [0, 0, 5], [0, 0, 4.9]], [[1, 1, 1]] * 3, [0.5] * 3, color=[0.1, 0.5, 0.9])
     pixel = rasterize(*parameters, **axis_camera())["rgb"][0, 4, 4].item()
     left = math.exp(-1.0)
     assert pixel == pytest.approx((1 - left) * (0.9 + left * 0.1 + left**2 * 0.5), rel=1e-13)
 
 
-def test_stop():
+def test_stop_ends_rays_by_transmittance():
     tau = math.log(100)  # each lets 1 % through, so T is 1, 0.01, 1e-4 before the first, second and third
     parameters = octahedra([[0, 0, z] for z in (4, 7, 10)], [[1, 1, 1]] * 3, [tau / 2] * 3)
     for stop, count in ((1.0, 1), (0.011, 1), (0.009, 2), (1.1e-4, 2), (0.9e-4, 3), (0.0, 3)):
@@ -285,7 +285,7 @@ def test_stop():
         assert (result["max_weight"][count:] == 0).all()
 
 
-def test_level_that_is_never_crossed():
+def test_median_depth_is_zero_if_the_level_is_not_reached():
     result = rasterize(*octahedra([[0, 0, 5]], [[1, 1, 1]], [0.1]), **axis_camera(), level=0.5)
     assert result["opacity"].max() > 0
     assert (result["depth_median"] == 0).all() and (result["normal_median"] == 0).all()
@@ -293,21 +293,21 @@ def test_level_that_is_never_crossed():
     assert crossed["depth_median"][4, 4].item() == pytest.approx(4 - math.log(0.9) / 0.1, rel=1e-13)
 
 
-def test_no_primitives():
+def test_no_primitives_give_the_background():
     parameters = [p[:0] for p in octahedra([[0, 0, 5]], [[1, 1, 1]], [1.0])[:5]] + [tensor([0.1, 0.2, 0.3])]
     result = rasterize(*parameters, **axis_camera())
     assert (result["rgb"] == parameters[5][:, None, None]).all()
     assert all((result[name] == 0).all() for name in IMAGES[1:]) and result["pixels"].shape == (0,)
 
 
-def test_without_geometry_the_picture_is_the_same():
+def test_colour_does_not_depend_on_geometry_output():
     parameters, camera = random_scene(7, 6, 16)
     less = rasterize(*parameters, **camera, geometry=False)
     assert set(less) == {"rgb", "opacity", "max_weight", "pixels"}
     assert_same(rasterize(*parameters, **camera), less, set(less), rtol=0, atol=0)
 
 
-def test_rejects_what_it_cannot_render():
+def test_invalid_parameters_are_refused():
     parameters, camera = random_scene(7, 2, 4)
     with pytest.raises(ValueError, match="5 coefficients"):
         rasterize(*parameters[:4], torch.zeros(2, 5, 3, dtype=torch.float64), parameters[5], **camera)
@@ -328,7 +328,7 @@ def quaternion_product(a, b):
 
 
 @pytest.mark.parametrize("turned", [True, False])
-def test_rigid_motion_of_scene_and_camera(turned):
+def test_images_are_invariant_to_rigid_motion(turned):
     # Harmonics stay in the world's axes, so a rotation keeps only degree 0; a translation keeps them all.
     parameters, camera = random_scene(8, 10, 1 if turned else 16, width=9, height=8)
     before = rasterize(*parameters, **camera)
@@ -342,7 +342,7 @@ def test_rigid_motion_of_scene_and_camera(turned):
     assert_same(before, rasterize(*parameters, **camera), rtol=1e-10, atol=1e-11)
 
 
-def test_scale_of_the_world():
+def test_images_scale_with_the_world():
     parameters, camera = random_scene(9, 10, 16, width=9, height=8, near=1.5)
     before = rasterize(*parameters, **camera)
     k = 37.0
@@ -355,14 +355,14 @@ def test_scale_of_the_world():
     assert_same(before, after, rtol=1e-10, atol=1e-10)
 
 
-def test_length_and_sign_of_a_quaternion_do_not_matter():
+def test_images_do_not_depend_on_length_and_sign_of_quaternions():
     parameters, camera = random_scene(10, 8)
     before = rasterize(*parameters, **camera)
     parameters[1] = parameters[1] * tensor([-1.0, 1e-3, 7.0, -0.2, 1e4, 1.0, 2.0, 3.0])[:, None]
     assert_same(before, rasterize(*parameters, **camera))
 
 
-def test_order_of_the_list_does_not_matter():
+def test_images_do_not_depend_on_the_order_of_primitives():
     parameters, camera = random_scene(11, 8)
     before = rasterize(*parameters, **camera)
     shuffle = torch.tensor([3, 1, 7, 0, 5, 2, 6, 4])
@@ -371,7 +371,7 @@ def test_order_of_the_list_does_not_matter():
     assert (after["pixels"] == before["pixels"][shuffle]).all()
 
 
-def test_float32_follows_float64():
+def test_float32_agrees_with_float64():
     parameters, camera = random_scene(12, 30, 16, width=16, height=12)
     # stop = 0 and the median left out: both can jump where rounding decides a comparison.
     exact = rasterize(*parameters, **camera, stop=0.0)
@@ -381,7 +381,7 @@ def test_float32_follows_float64():
         assert (single[name] - exact[name]).abs().max() < 2e-5 * max(1.0, exact[name].abs().max().item())
 
 
-def test_mean_depth_fraction():
+def test_mean_depth_fraction_agrees_with_exact_values():
     for tau in (0.0, 1e-9, 0.01, 0.2499, 0.25, 0.3, 1.0, 5.0, 40.0, 1e3):
         if tau == 0:
             expected = 0.5
@@ -415,7 +415,7 @@ def test_harmonics_are_orthonormal():
     torch.testing.assert_close(basis.T @ (weight[:, None] * basis), torch.eye(16, dtype=torch.float64), **EXACT)
 
 
-def test_harmonics_are_the_legendre_functions_with_the_condon_shortley_sign():
+def test_harmonics_agree_with_scipy():
     from scipy.special import assoc_legendre_p  # includes (-1)^m
 
     g = torch.Generator().manual_seed(0)
@@ -433,13 +433,13 @@ def test_harmonics_are_the_legendre_functions_with_the_condon_shortley_sign():
     torch.testing.assert_close(reference.sh_basis(direction, 16), tensor(np.stack(expected, -1)), **EXACT)
 
 
-def test_values_of_harmonics():
+def test_harmonics_of_axis_directions():
     basis = reference.sh_basis(tensor([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]), 4)
     c1 = 0.4886025119029199
     torch.testing.assert_close(basis, tensor([[C0, 0, 0, -c1], [C0, -c1, 0, 0], [C0, 0, c1, 0]]), rtol=1e-15, atol=0)
 
 
-def test_colour_is_seen_from_the_camera_to_the_centre_in_world_axes():
+def test_colour_uses_the_world_direction_from_camera_to_centre():
     sh = torch.zeros(2, 4, 3, dtype=torch.float64)
     sh[:, 3, 0] = -1.0  # + C1 x in red
     sh[:, 1, 1] = 9.0  # - 9 C1 y in green

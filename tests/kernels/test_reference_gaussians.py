@@ -1,4 +1,4 @@
-"""The torch twin's Gaussians against the splatting formula."""
+"""Gaussians of the reference, compared with the splatting formula."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def literal_gaussians(parameters, camera, blur=0.0, near=0.01, stop=1e-3, level=
 @pytest.mark.parametrize(
     "count,blur,more", [(1, 0.0, {}), (2, 0.3, {}), (12, 0.3, {"stop": 0.2}), (12, 0.0, {"depth": 1.0})]
 )
-def test_gaussians_equal_the_splatting_formula(count, blur, more):
+def test_gaussians_agree_with_the_splatting_formula(count, blur, more):
     parameters, camera = scene("gaussian", 70 + count, count, 9, width=9, height=8, **more)
     definition = {name: camera[name] for name in ("stop",) if name in camera}
     expected = literal_gaussians(parameters, camera, blur, **definition)
@@ -86,7 +86,7 @@ def one_gaussian(extent, opacity=0.8, z=4.0, **more):
     return rasterize(*parameters, **axis_camera(**more), primitive="gaussian", screen_filter=more.pop("k", 0.0))
 
 
-def test_gaussian_on_the_axis_cap_and_floor():
+def test_limits_of_alpha_of_a_gaussian_on_the_axis():
     result = one_gaussian([0.5, 0.25, 0.1])  # 1 px and 0.5 px
     assert result["opacity"][4, 4].item() == pytest.approx(0.8, rel=1e-14)
     assert result["opacity"][4, 5].item() == pytest.approx(0.8 * math.exp(-0.5), rel=1e-13)
@@ -102,7 +102,7 @@ def test_gaussian_on_the_axis_cap_and_floor():
         assert (one_gaussian([0.5, 0.5, 0.5], 0.8, z)["pixels"].item() > 0) == drawn
 
 
-def test_flat_gaussians():
+def test_degenerate_gaussians_are_drawn_face_on_or_with_a_filter():
     assert one_gaussian([0.5, 0.5, 0.0])["opacity"][4, 4].item() == pytest.approx(0.8, rel=1e-14)  # face on
     for extent in ([0.5, 0.0, 0.5], [0.0, 0.0, 0.0]):  # edge on, and a point: nothing without a filter
         parameters = [p.requires_grad_() for p in octahedra([[0, 0, 4]], [extent], [0.8])]

@@ -1,4 +1,4 @@
-"""Gradients of the torch twin against differences, and their finiteness."""
+"""Gradients of the reference, compared with finite differences, and finite at edges and vertices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def all_outputs(camera):
     return run
 
 
-def test_gradients_of_every_output():
+def test_gradients_of_all_outputs_agree_with_finite_differences():
     parameters, camera = random_scene(20, 4, 4)
     parameters = [p.requires_grad_() for p in parameters]
     result = rasterize(*parameters, **camera)
@@ -38,7 +38,7 @@ def test_gradients_of_every_output():
         (23, 1, {"near": 2.2, "level": 0.7}),
     ],
 )
-def test_gradients_along_random_directions(seed, coefficients, more):
+def test_directional_gradients_agree_with_finite_differences(seed, coefficients, more):
     parameters, camera = random_scene(seed, 6, coefficients, width=7, **more)
     pose = camera.pop("world_to_camera")
     inputs = [p.requires_grad_() for p in (*parameters, pose)]
@@ -88,7 +88,7 @@ def test_gradient_of_an_opaque_primitive_is_finite():
         assert grad.isfinite().all()
 
 
-def test_gradient_through_the_median_depth():
+def test_gradient_of_the_median_depth_agrees_with_the_closed_form():
     # On the axis with extent e and density s: median = z - e + ln 2 / s.
     parameters = [p.requires_grad_() for p in octahedra([[0, 0, 5]], [[1.0, 1.0, 0.7]], [0.9])]
     median = rasterize(*parameters, **axis_camera())["depth_median"][4, 4]

@@ -1,4 +1,4 @@
-"""The torch twin on every variant: an independent program, gradients, precision, arguments."""
+"""The reference on every variant: an independent program, gradients, precision, and arguments."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def interval(body, points, count, low, high):
 
 
 def segments(chords):
-    """Neighbouring ends along one ray, and who fills the space between, by asking at its middle."""
+    """Segments between adjacent ends along one ray, and the primitives that contain their middle."""
     ends = sorted({t for t_in, t_out in chords.values() for t in (t_in, t_out)})
     for a, b in itertools.pairwise(ends):
         yield a, b, [n for n, (t_in, t_out) in chords.items() if t_in < (a + b) / 2 < t_out]
@@ -112,7 +112,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(30)
 
 
 def literal_render(parameters, camera, primitive, model, order, k=0.0, near=0.01, stop=1e-3, level=0.5, far=40.0):
-    """Every output by the words of its definition, in numpy; overlap by Gauss-Legendre in each segment."""
+    """Every output by its definition in numpy, with Gauss-Legendre quadrature of overlap in each segment."""
     center, quaternion, extent, density, sh, background = (p.detach().numpy() for p in parameters)
     pose = camera["world_to_camera"].numpy()
     turn, shift, height, width = pose[:3, :3], pose[:3, 3], camera["height"], camera["width"]
@@ -203,7 +203,7 @@ def literal_render(parameters, camera, primitive, model, order, k=0.0, near=0.01
 )
 @pytest.mark.parametrize("k", [0.0, 0.7])
 @pytest.mark.parametrize("primitive,model,order", VARIANTS)
-def test_equals_a_program_that_only_asks_whether_points_are_inside(primitive, model, order, k, more):
+def test_reference_agrees_with_a_program_of_inside_tests(primitive, model, order, k, more):
     seed = 40 + VARIANTS.index((primitive, model, order))
     parameters, camera = scene(primitive, seed, 9, width=7, height=6, **more)
     definition = {name: camera[name] for name in ("near", "stop", "level") if name in camera}
@@ -219,7 +219,7 @@ def test_equals_a_program_that_only_asks_whether_points_are_inside(primitive, mo
 
 @pytest.mark.parametrize("k", [0.0, 0.6])
 @pytest.mark.parametrize("primitive,model,order", [*VARIANTS, ("gaussian", "affine", "center")])
-def test_gradients_along_random_directions(primitive, model, order, k):
+def test_directional_gradients_agree_with_finite_differences(primitive, model, order, k):
     seed = 80 + len(model) + len(order)
     for more in ({}, {"stop": 0.35, "level": 0.6, "depth": 1.2}):
         parameters, camera = scene(primitive, seed, 6, **more)
@@ -236,7 +236,7 @@ def test_gradients_along_random_directions(primitive, model, order, k):
 
 
 @pytest.mark.parametrize("primitive", POLYHEDRA)
-def test_every_gradient_of_overlap_with_a_filter(primitive):
+def test_gradients_of_overlap_with_a_filter_agree_with_finite_differences(primitive):
     parameters, camera = scene(primitive, 90, 3, 1, width=4, height=4)
     inputs = [p.requires_grad_() for p in parameters]
 
@@ -249,7 +249,7 @@ def test_every_gradient_of_overlap_with_a_filter(primitive):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("center,near", [((0, 0, 2), 0.01), ((1, 0, 2), 0.01), ((0, 0, 2), 1), ((0.5, 0, 0.5), 0.01)])
-def test_gradients_are_finite_everywhere(center, near, dtype):
+def test_gradients_are_finite_in_degenerate_cases(center, near, dtype):
     # Through vertices and edges, parallel faces, coincident copies, no density, and an opaque one.
     for (primitive, model, order), k in itertools.product([*VARIANTS, ("gaussian", "exact", "center")], (0.0, 0.5)):
         parameters = octahedra([center, center, (0, 0, 4), (0, 0, 5)], [[1, 1, 1]] * 4, [1.0, 1.0, 0.0, 1e6])
@@ -268,7 +268,7 @@ def test_gradients_are_finite_everywhere(center, near, dtype):
 
 
 @pytest.mark.parametrize("primitive,model,order", [*VARIANTS, ("gaussian", "affine", "center")])
-def test_float32_follows_float64(primitive, model, order):
+def test_float32_agrees_with_float64(primitive, model, order):
     parameters, camera = scene(primitive, 95, 30, width=16, height=12)
     options = dict(primitive=primitive, ray_model=model, order=order, screen_filter=0.3, stop=0.0)
     exact = rasterize(*parameters, **camera, **options)
@@ -279,7 +279,7 @@ def test_float32_follows_float64(primitive, model, order):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_no_primitives_and_no_hits(order):
+def test_no_primitives_or_hits_give_the_background(order):
     parameters, camera = scene("tetrahedron", 96, 2)
     background = parameters[5]
     parameters[0] = parameters[0] + 100
@@ -290,7 +290,7 @@ def test_no_primitives_and_no_hits(order):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_without_geometry_the_picture_is_the_same(order):
+def test_colour_does_not_depend_on_geometry_output(order):
     parameters, camera = scene("tetrahedron", 97, 6)
     options = dict(primitive="tetrahedron", order=order)
     less = rasterize(*parameters, **camera, **options, geometry=False)
@@ -298,7 +298,7 @@ def test_without_geometry_the_picture_is_the_same(order):
     assert_same(rasterize(*parameters, **camera, **options), less, set(less), rtol=0, atol=0)
 
 
-def test_rejects_what_it_does_not_know():
+def test_invalid_options_are_refused():
     parameters, camera = scene("octahedron", 98, 2)
     for options, message in (
         ({"primitive": "gaussian", "order": "entry"}, "no entry"),

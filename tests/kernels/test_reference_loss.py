@@ -1,4 +1,4 @@
-"""The photometric loss of the torch twin: windows one by one, weights, gradients."""
+"""The photometric loss of the reference: windows one by one, weights, and gradients."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def random_images(seed, height=9, width=13):
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_loss_equals_windows_one_by_one(weighted):
+def test_loss_agrees_with_windows_one_by_one(weighted):
     a, b, weight = random_images(0)
     ssim = np.stack([literal_ssim(a[c].numpy(), b[c].numpy()) for c in range(3)])
     w = np.broadcast_to(weight.numpy() if weighted else 1.0, ssim.shape)
@@ -61,7 +61,7 @@ def test_loss_of_equal_images_is_zero():
     assert photometric_loss(a, b, 0.2, torch.zeros_like(weight)).item() == 0
 
 
-def test_weight_of_one_is_no_weight_and_its_scale_does_not_matter():
+def test_uniform_weights_and_their_scale_do_not_change_the_loss():
     a, b, weight = random_images(2)
     ones = torch.ones_like(weight)
     assert photometric_loss(a, b, 0.2, ones).item() == pytest.approx(photometric_loss(a, b, 0.2).item(), rel=1e-13)
@@ -70,7 +70,7 @@ def test_weight_of_one_is_no_weight_and_its_scale_does_not_matter():
 
 
 @pytest.mark.parametrize("weighted", [False, True])
-def test_gradient_of_the_loss(weighted):
+def test_gradient_of_the_loss_agrees_with_finite_differences(weighted):
     a, b, weight = random_images(3, 5, 6)
     inputs = (a.requires_grad_(), b, 0.2, weight if weighted else None)
     assert torch.autograd.gradcheck(photometric_loss, inputs, eps=1e-6, atol=1e-8, rtol=1e-5)

@@ -1,4 +1,4 @@
-"""The torch twin's orders, affine rays and screen filter: closed forms and invariants."""
+"""Orders, affine rays and screen filter of the reference: closed forms and invariances."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("primitive,model", list(itertools.product(POLYHEDRA, MODELS)))
-def test_orders_agree_where_nothing_overlaps(primitive, model):
+def test_orders_agree_without_overlap(primitive, model):
     parameters, camera = scene(primitive, 61, 6, width=9, height=8)
     turn, shift = camera["world_to_camera"][:3, :3], camera["world_to_camera"][:3, 3]
     spaced = 0.3 * torch.randn(6, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -38,7 +38,7 @@ def test_orders_agree_where_nothing_overlaps(primitive, model):
 
 
 def nested(order, **more):
-    """On the axis a big one fills 2 to 8 and a small one, whose centre is nearer, 3.5 to 4.5."""
+    """On the axis a large primitive fills 2 to 8, and a small one with nearer centre 3.5 to 4.5."""
     parameters = octahedra(
         [[0, 0, 5], [0, 0, 4]], [[1, 1, 3], [1, 1, 0.5]], [0.2, 0.9], color=[0.3, 0.9], background=(0.5,) * 3
     )
@@ -47,7 +47,7 @@ def nested(order, **more):
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_nested_primitives_in_the_three_orders(model):
+def test_nested_primitives_agree_with_closed_forms_in_all_orders(model):
     big, small = -math.expm1(-1.2), -math.expm1(-0.9)
     end = math.exp(-2.1)
     by_center, by_entry, overlap = (nested(order, ray_model=model) for order in ORDERS)
@@ -93,7 +93,7 @@ def test_overlap_ends_at_the_first_event_below_stop():
         assert (result["max_weight"] > 0).tolist() == [bool(n) for n in pixels]
 
 
-def test_distortion_of_one_primitive_under_overlap():
+def test_distortion_of_one_primitive_agrees_with_the_closed_form():
     # Thin: uniform over the chord, so A^2 L^2 / 12. Thick: exponential, so 1 / density^2.
     for extent, density, want in ((0.7, 1e-5, (1.4e-5 * 1.4) ** 2 / 12), (3.0, 20.0, 1 / 400)):
         parameters = octahedra([[0, 0, 5]], [[1, 1, extent]], [density])
@@ -120,7 +120,7 @@ def test_coincident_copies_share_the_density_under_overlap(primitive, model):
 
 
 @pytest.mark.parametrize("order", ["entry", "overlap"])
-def test_order_of_the_list_does_not_matter_to_rays(order):
+def test_images_do_not_depend_on_the_order_of_primitives(order):
     parameters, camera = scene("tetrahedron", 63, 8, width=9, height=8, stop=0.2)
     shuffle = torch.tensor([3, 1, 7, 0, 5, 2, 6, 4])
     before = rasterize(*parameters, **camera, primitive="tetrahedron", order=order)
@@ -131,7 +131,7 @@ def test_order_of_the_list_does_not_matter_to_rays(order):
     assert (after["pixels"] == before["pixels"][shuffle]).all()
 
 
-def test_ties_of_entry_are_by_index():
+def test_ties_of_entry_are_ordered_by_index():
     # Both are cut by the near plane, so both begin at it; the centres say the opposite.
     parameters = octahedra(
         [[0, 0, 0.4], [0, 0, 0.3], [0, 0, 3]], [[1, 1, 1]] * 3, [0.5, 0.7, 0.3], color=[0.1, 0.5, 0.9]
@@ -142,14 +142,14 @@ def test_ties_of_entry_are_by_index():
 
 
 @pytest.mark.parametrize("block", [1, 200])
-def test_blocks_of_rays_do_not_show(block, monkeypatch):
+def test_images_do_not_depend_on_blocks_of_rays(block, monkeypatch):
     parameters, camera = scene("octahedron", 64, 10, width=9, height=8)
     whole = rasterize(*parameters, **camera, order="overlap")
     monkeypatch.setattr(reference_blend, "BLOCK", block)
     assert_same(whole, rasterize(*parameters, **camera, order="overlap"), rtol=1e-13, atol=1e-14)
 
 
-def test_depth_variance_and_mean_transmittance():
+def test_depth_variance_and_mean_transmittance_agree_with_mpmath():
     with mpmath.workdps(60):
         for tau in (1e-9, 1e-3, 0.1, 0.2499, 0.25, 0.3, 1.0, 5.0, 40.0, 1e3):
             x = mpmath.mpf(tau)
@@ -168,7 +168,7 @@ def test_depth_variance_and_mean_transmittance():
 
 
 @pytest.mark.parametrize("primitive", POLYHEDRA)
-def test_affine_rays_become_exact_with_the_square_of_the_size(primitive):
+def test_error_of_affine_rays_is_quadratic_in_size(primitive):
     g = torch.Generator().manual_seed(7)
     center = tensor([[0.9, -0.6, 2.0]])
     rotation = torch.randn(1, 4, generator=g, dtype=torch.float64)
@@ -194,7 +194,7 @@ def test_affine_rays_become_exact_with_the_square_of_the_size(primitive):
     assert (abs(order[-1] - 2) < 0.15).all(), order
 
 
-def test_affine_needs_the_centre_beyond_the_near_plane_and_knows_no_other():
+def test_affine_rays_use_the_near_plane_for_centres_only():
     parameters = octahedra([[0, 0, 0.5]], [[1, 1, 1]], [0.8])
     inside = pixel_of(rasterize(*parameters, **axis_camera(near=0.4), ray_model="affine"), 4, 4)
     assert inside["opacity"].item() == pytest.approx(-math.expm1(-1.6), rel=1e-14)
@@ -214,7 +214,7 @@ def total_thickness(parameters, camera, **options):
 
 
 @pytest.mark.parametrize("primitive,model", list(itertools.product(POLYHEDRA, MODELS)))
-def test_screen_filter_keeps_the_thickness_of_the_screen(primitive, model):
+def test_screen_filter_keeps_the_total_thickness(primitive, model):
     # Small, so that |v| hardly changes over it: exact thickness carries the |v| of the true pixel.
     extent = [0.003, 0.004, 0.002] if primitive == "octahedron" else [0.003, 0.004, 0.002, 0.005]
     parameters = [
@@ -239,7 +239,7 @@ def test_screen_filter_keeps_the_thickness_of_the_screen(primitive, model):
         assert b > 60
 
 
-def test_screen_filter_on_the_axis():
+def test_screen_filter_on_the_axis_agrees_with_the_closed_form():
     parameters = octahedra([[0, 0, 5]], [[1.0, 0.5, 0.7]], [0.9])
     k = 0.8
     for model in MODELS:
@@ -259,7 +259,7 @@ def test_screen_filter_on_the_axis():
         torch.testing.assert_close(narrow["depth_first"], wide["depth_first"], **EXACT)
 
 
-def test_screen_filter_spares_what_crosses_the_near_plane():
+def test_screen_filter_skips_primitives_across_the_near_plane():
     parameters = octahedra([[0.1, 0, 1.0]], [[0.5, 0.5, 0.8]], [0.9])
     for near, same in ((0.21, True), (0.19, False)):
         a, b = (rasterize(*parameters, **axis_camera(near=near), screen_filter=k) for k in (0.0, 3.0))

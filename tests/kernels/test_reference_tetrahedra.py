@@ -1,4 +1,4 @@
-"""Tetrahedra in the torch twin: their four triangles, their pieces, and those without size."""
+"""Tetrahedra of the reference: their four triangles, their pieces, and those without size."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def moeller_trumbore(ray, a, b, c):
     return (e2 @ k) / det if u >= 0 and v >= 0 and u + v <= 1 else None
 
 
-def test_tetrahedron_is_its_four_triangles():
+def test_tetrahedron_agrees_with_its_four_triangles():
     quaternion, extent = [0.9, 0.3, -0.2, 0.4], [0.7, 1.4, 0.9, 1.1]
     parameters = [tensor(x) for x in ([[0.2, -0.1, 4.0]], [quaternion], [extent], [0.8], [gray(1.0)], [0.0] * 3)]
     camera = axis_camera(24, 24, 26.0)
@@ -50,7 +50,7 @@ def test_tetrahedron_is_its_four_triangles():
     assert 50 < met < 400
 
 
-def test_tetrahedron_on_the_axis():
+def test_tetrahedron_on_the_axis_agrees_with_the_closed_form():
     # Turned so that b_0 is the axis: vertex 0 nearest at z - d, the face behind it at z + d/3.
     b = BASIS[0]
     axis = np.cross(b, [0, 0, -1])
@@ -76,8 +76,7 @@ def test_tetrahedron_on_the_axis():
 
 
 def cut_tetrahedron():
-    """A regular tetrahedron, and the octahedron and the four tetrahedra that planes through its edges' middles cut it
-    into."""
+    """A regular tetrahedron, and the octahedron and four tetrahedra that cuts through its edge midpoints make."""
     d, density = 1.2, 0.7
     center, turn = np.array([0.1, -0.2, 4.0]), [0.8, 0.1, 0.5, -0.3]
     vertices = d * BASIS @ reference.rotation_matrix(tensor(turn)).numpy().T
@@ -92,7 +91,7 @@ def cut_tetrahedron():
     return whole, middle, corners
 
 
-def test_thickness_of_a_tetrahedron_is_that_of_the_pieces_it_is_cut_into():
+def test_thickness_of_a_tetrahedron_is_the_sum_of_its_pieces():
     whole, middle, corners = cut_tetrahedron()
     camera, background = axis_camera(20, 20, 24.0), torch.zeros(3, dtype=torch.float64)
     tau = [
@@ -103,7 +102,7 @@ def test_thickness_of_a_tetrahedron_is_that_of_the_pieces_it_is_cut_into():
     torch.testing.assert_close(tau[0], tau[1] + tau[2], rtol=1e-10, atol=1e-12)
 
 
-def test_overlap_does_not_see_a_cut():
+def test_overlap_of_pieces_equals_the_whole_tetrahedron():
     whole, middle, corners = cut_tetrahedron()
     camera, background = axis_camera(20, 20, 24.0), tensor([0.1, 0.2, 0.3])
     want = rasterize(*whole, background, **camera, primitive="tetrahedron", order="overlap", stop=0.0)

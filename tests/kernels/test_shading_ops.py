@@ -1,4 +1,4 @@
-"""Plain regions compared by their shading: float64's answer, the derivative that it claims, and what it refuses."""
+"""Comparison of plain regions by shading: agreement with float64, convergence, and invalid input."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def camera_at(x, y):
 
 
 def pair(seed=0, tone=0.0, noise=0.3):
-    """A region of one photograph and the box means of another: light that falls off along the wall PLANE, by another
-    exposure and with a bend."""
+    """A region of one photograph and box means of another: light falls off along the wall PLANE, with different
+    exposure and a bend."""
     rng, own, other = np.random.default_rng(seed), camera_at(0.0, 0.0), camera_at(0.5, -0.2)
     y, x = (axis.ravel() for axis in np.mgrid[6:38:2, 8:52:2])
     rays = own.ray_grid()[y, x].astype(np.float64)
@@ -45,7 +45,7 @@ def pair(seed=0, tone=0.0, noise=0.3):
 
 
 @pytest.mark.parametrize(("seed", "tone", "plane"), [(0, 0.0, PLANE), (1, 0.5, PLANE), (2, 0.2, PLANE * 1.1)])
-def test_it_agrees_with_float64(seed, tone, plane):
+def test_compare_shading_agrees_with_float64(seed, tone, plane):
     given = pair(seed, tone)
     found = compare_shading(plane=plane, moves=MOVES, least=1, **given)
     shown, left, left_variance, variance, information, downhill = reference(plane=plane, moves=MOVES, **given)
@@ -58,7 +58,7 @@ def test_it_agrees_with_float64(seed, tone, plane):
     np.testing.assert_allclose(found.downhill, downhill, rtol=1e-6, atol=1e-6 * np.abs(downhill).max())
 
 
-def test_its_step_leads_back_to_the_true_plane():
+def test_gauss_newton_steps_converge_to_the_true_plane():
     given = pair(noise=0.01)
     wrong = PLANE + MOVES @ [0.02, -0.015, 0.01]
     for _ in range(4):
@@ -67,14 +67,14 @@ def test_its_step_leads_back_to_the_true_plane():
     np.testing.assert_allclose(wrong, PLANE, atol=2e-3)
 
 
-def test_an_exposure_and_a_bend_leave_nothing_on_the_true_plane():
+def test_exposure_and_bend_leave_no_residual_on_the_true_plane():
     # Interpolation of means, in single precision, is all that is left.
     assert compare_shading(plane=PLANE, moves=MOVES, least=1, **pair(noise=0.0)).left_variance < 0.01
     assert compare_shading(plane=PLANE, moves=MOVES, least=1, **pair(noise=0.0, tone=0.3)).left_variance < 0.01
     assert compare_shading(plane=1.3 * PLANE, moves=MOVES, least=1, **pair(noise=0.0)).left_variance > 0.1
 
 
-def test_too_few_boxes_are_none():
+def test_too_few_boxes_give_an_empty_result():
     given = pair()
     found = compare_shading(plane=PLANE, moves=MOVES, least=1, **given)
     fewer = compare_shading(plane=PLANE, moves=MOVES, least=found.boxes + 1, **given)
@@ -83,7 +83,7 @@ def test_too_few_boxes_are_none():
     assert behind.boxes == 0
 
 
-def test_photographs_of_one_brightness_have_finite_equations():
+def test_uniform_photographs_give_finite_equations():
     given = pair(noise=0.0)
     given["value"][:], given["means"][:] = 100.0, (100.0, 0.0, 0.0)
     found = compare_shading(plane=PLANE, moves=MOVES, least=1, **given)
@@ -100,6 +100,6 @@ def test_photographs_of_one_brightness_have_finite_equations():
         ({"moves": np.zeros((2, 3))}, "moves has shape"),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused(changed, said):
+def test_invalid_arrays_are_refused(changed, said):
     with pytest.raises(ValueError, match=said):
         compare_shading(**{"plane": PLANE, "moves": MOVES, "least": 1, **pair(), **changed})

@@ -1,5 +1,4 @@
-"""Optical depths of segments by the compiled tree against closed forms and a float64 sum over every face of every
-primitive."""
+"""Optical depths of segments by the compiled tree, compared with closed forms and a float64 sum over all faces."""
 
 from __future__ import annotations
 
@@ -44,8 +43,7 @@ def depths(tree, origin, ends, begin=None, most=np.inf) -> np.ndarray:
 
 
 def sum_over_faces(p: Primitives, origin, ends, begin=0.0) -> np.ndarray:
-    """Each segment is clipped by the plane of each face of each primitive, as its vertices give it: no slabs, no
-    tree."""
+    """Clip each segment by all face planes of each primitive, computed from its vertices."""
     faces = KINDS[p.kind].faces
     corners = p.vertices[:, faces]
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
@@ -68,7 +66,7 @@ def sum_over_faces(p: Primitives, origin, ends, begin=0.0) -> np.ndarray:
 @pytest.mark.parametrize("name", KERNELS)
 @pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
 @pytest.mark.parametrize("count", [1, 4, 5, 300])
-def test_many_overlapping_primitives(kind, count, name):
+def test_depths_of_overlapping_primitives_agree_with_a_sum_over_faces(kind, count, name):
     p = primitives(count, count, kind, size=0.8)
     ends = np.random.default_rng(1).normal(scale=1.5, size=(203, 3))
     wanted = sum_over_faces(p, ORIGIN, ends)
@@ -78,7 +76,7 @@ def test_many_overlapping_primitives(kind, count, name):
     assert np.abs(found - wanted).max() < 1e-10 * max(1.0, wanted.max())
 
 
-def test_one_octahedron_in_closed_form():
+def test_depths_of_an_octahedron_agree_with_the_closed_form():
     one = Primitives([[0, 0, 0]], [[1, 0, 0, 0]], [[2.0, 1.0, 0.5]], [3.0], np.zeros((1, 1, 3)))
     tree = tree_of(one)
     # Along z at (x, y) the chord is 2 * 0.5 * (1 - |x| / 2 - |y|).
@@ -92,7 +90,7 @@ def test_one_octahedron_in_closed_form():
         assert depths(tree, (0, 0, -7), ends) == 0
 
 
-def test_one_tetrahedron_in_closed_form():
+def test_depths_of_a_tetrahedron_agree_with_the_closed_form():
     # From the middle to a vertex at distance e, and away from it to the face opposite: barycentric coordinates are
     # equal to 1 / 4 in the middle of a regular one, so the face lies a third as far.
     one = Primitives([[1, 2, 3]], [[1, 0, 0, 0]], [[0.6, 0.6, 0.6, 0.6]], [5.0], np.zeros((1, 1, 3)), "tetrahedron")
@@ -103,7 +101,7 @@ def test_one_tetrahedron_in_closed_form():
 
 
 @pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
-def test_begin_inside_and_end_inside(kind):
+def test_segments_that_begin_or_end_inside_primitives(kind):
     p = primitives(7, 60, kind, size=1.2)
     rng = np.random.default_rng(2)
     ends, begin = rng.normal(scale=0.6, size=(100, 3)), rng.uniform(0.0, 1.2, 100)
@@ -127,7 +125,7 @@ def test_segments_parallel_to_faces_and_axes():
         assert 0 <= depths(tree, start, [end])[0] <= np.sqrt(2) + 1e-9
 
 
-def test_a_segment_without_length_and_no_primitives():
+def test_empty_segments_and_no_primitives_give_zero():
     tree = tree_of(primitives(0, 20, size=2.0))
     assert (depths(tree, (0, 0, 0), [(0, 0, 0)]) == 0).all()
     assert depths(tree, (0, 0, 0), np.zeros((0, 3))).shape == (0,)
@@ -136,7 +134,7 @@ def test_a_segment_without_length_and_no_primitives():
         assert len(empty) == 0 and (depths(empty, (0, 0, 0), np.ones((5, 3))) == 0).all()
 
 
-def test_what_does_not_absorb_is_left_out():
+def test_primitives_without_volume_or_density_are_left_out():
     p = primitives(3, 6)
     tensors = [torch.from_numpy(x).double() for x in (p.center, p.rotation, p.extent, p.density)]
     tensors[2][1, 2], tensors[2][2, 0], tensors[3][3], tensors[3][4] = 0.0, -1.0, 0.0, -2.0
@@ -150,7 +148,7 @@ def test_what_does_not_absorb_is_left_out():
     assert np.abs(depths(tree, ORIGIN, ends) - sum_over_faces(plain, ORIGIN, ends)).max() < 1e-11
 
 
-def test_a_sum_is_cut_off():
+def test_depths_are_limited_by_most():
     p = primitives(5, 200, size=1.0)
     ends = np.random.default_rng(3).normal(size=(300, 3))
     whole = depths(tree_of(p), ORIGIN, ends)
@@ -160,7 +158,7 @@ def test_a_sum_is_cut_off():
 
 
 @pytest.mark.parametrize("name", KERNELS)
-def test_no_value_depends_on_threads_or_on_other_ends(name):
+def test_depths_do_not_depend_on_threads_or_other_segments(name):
     p = primitives(6, 400)
     ends = np.random.default_rng(4).normal(size=(1500, 3))
     with kernels(name, threads=1):
@@ -172,7 +170,7 @@ def test_no_value_depends_on_threads_or_on_other_ends(name):
     assert np.array_equal(one, two) and np.array_equal(one[::7], some) and one.max() > 1
 
 
-def test_primitives_in_the_same_place():
+def test_depths_of_coincident_primitives_add_up():
     p = primitives(8, 1)
     same = Primitives(
         *(np.repeat(getattr(p, n), 37, axis=0) for n in ("center", "rotation", "extent", "density", "sh"))
@@ -181,7 +179,7 @@ def test_primitives_in_the_same_place():
     assert depths(tree_of(same), ORIGIN, ends) == pytest.approx(37 * depths(tree_of(p), ORIGIN, ends), rel=1e-12)
 
 
-def test_the_same_light_as_the_renderer():
+def test_depths_agree_with_the_rasterizer():
     p = primitives(9, 150, size=0.5)
     pose = np.eye(4)
     pose[:3, 3] = 0.1, 0.2, 5.0
@@ -193,13 +191,13 @@ def test_the_same_light_as_the_renderer():
     assert np.abs(found.reshape(16, 20) - opacity.numpy()).max() < 1e-9
 
 
-def test_float32_primitives():
+def test_float32_primitives_give_the_same_depths():
     p = primitives(10, 100)
     ends = np.random.default_rng(5).normal(size=(50, 3))
     assert np.array_equal(depths(tree_of(p, torch.float32), ORIGIN, ends), depths(tree_of(p), ORIGIN, ends))
 
 
-def test_what_is_refused():
+def test_invalid_input_is_refused():
     p = primitives(11, 3)
     tensors = [torch.from_numpy(x) for x in (p.center, p.rotation, p.extent, p.density)]
     with pytest.raises(ValueError, match="octahedra and tetrahedra only"):

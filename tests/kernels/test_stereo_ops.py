@@ -1,4 +1,4 @@
-"""PatchMatch stereo in the core: its cost against float64, planes that it has to find, bits that must not change."""
+"""PatchMatch stereo, support and surface fits in the core: agreement with float64, accuracy, reproducibility."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def images() -> list[StereoImage]:
 
 
 def some_planes(camera: Camera, seed: int = 0) -> DepthPlanes:
-    """Planes near the wall and far from it."""
+    """Random planes near the wall and far from it."""
     rng = np.random.default_rng(seed)
     planes = DepthPlanes.unknown(camera.height, camera.width)
     planes.plane[..., 0] = (1 / wall_depth(camera)) * rng.uniform(0.8, 1.2, (camera.height, camera.width))
@@ -74,7 +74,7 @@ def test_the_cost_agrees_with_float64(images):
     assert np.abs(planes.cost - wanted).max() < 36 * 6e-8 * 255**2 / 1.5
 
 
-def test_photographs_that_do_not_show_a_point_have_no_say(images):
+def test_sources_that_do_not_show_a_point_do_not_change_its_cost(images):
     away = StereoImage.of(look_at((0, 0, -3), (0, 0, -6), size=(60, 44), focal=70.0, up=(0, 1, 0)), images[0].grey)
     costs = []
     for sources in (images[1:3], [images[1], away, images[2], away, away]):
@@ -85,7 +85,7 @@ def test_photographs_that_do_not_show_a_point_have_no_say(images):
     assert both.mean() > 0.5 and np.array_equal(costs[0][both], costs[1][both])
 
 
-def test_it_finds_a_slanted_wall(images):
+def test_patch_match_finds_a_slanted_wall(images):
     planes = DepthPlanes.unknown(*images[0].grey.shape)
     patch_match(images[0], images[1:], planes, (0.0, 0.8), 1.0, 5)
     inside = np.s_[6:-6, 6:-6]  # where no window reaches beyond the photograph
@@ -94,8 +94,8 @@ def test_it_finds_a_slanted_wall(images):
     assert np.median(error) < 0.003 and (error < 0.01).mean() > 0.97
 
 
-def test_a_far_wall_is_told_from_a_near_one():
-    """Rays of pure rotation agree at infinity and nowhere else."""
+def test_patch_match_finds_a_background_at_infinity():
+    """Grey values depend on the direction only, so photographs agree only at infinity."""
     near, far = CAMERAS[0], []
     for camera in CAMERAS:
         rays = camera.world_rays()
@@ -106,7 +106,7 @@ def test_a_far_wall_is_told_from_a_near_one():
     assert np.median(planes.plane[8:-8, 8:-8, 0]) < 0.01 / np.median(wall_depth(near))
 
 
-def test_what_has_no_texture_neither_agrees_nor_disagrees():
+def test_the_cost_without_texture_is_one():
     rng = np.random.default_rng(3)
     plain = [StereoImage.of(c, (100 + (rng.random((c.height, c.width)) < 0.5)).astype(np.uint8)) for c in CAMERAS]
     planes = some_planes(CAMERAS[0])
@@ -116,7 +116,7 @@ def test_what_has_no_texture_neither_agrees_nor_disagrees():
     assert np.abs(planes.cost[10:-10, 10:-10] - 1).max() < 0.012
 
 
-def test_depths_of_neighbours_that_contradict_cost_more(images):
+def test_contradicting_source_depths_increase_the_cost(images):
     planes = some_planes(CAMERAS[0])
     planes.plane[..., 0] = 1 / wall_depth(CAMERAS[0])
     alone, right, wrong = (DepthPlanes(planes.plane.copy(), planes.cost.copy(), planes.chosen.copy()) for _ in range(3))
@@ -130,7 +130,7 @@ def test_depths_of_neighbours_that_contradict_cost_more(images):
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_threads_change_no_bit(images, threads):
+def test_patch_match_does_not_depend_on_threads(images, threads):
     before, found = ops.threads(), []
     try:
         for count in (1, threads):
@@ -143,7 +143,7 @@ def test_threads_change_no_bit(images, threads):
     assert all(np.array_equal(getattr(found[0], k), getattr(found[1], k)) for k in ("plane", "cost", "chosen"))
 
 
-def test_all_instruction_sets_have_the_same_costs(images):
+def test_costs_agree_between_instruction_sets(images):
     before, costs = ops.instruction_set(), []
     try:
         for name in ("scalar", before):
@@ -156,7 +156,7 @@ def test_all_instruction_sets_have_the_same_costs(images):
     assert np.abs(costs[0] - costs[1]).max() < 36 * 6e-8 * 255**2  # as against float64, with variances of 1 at least
 
 
-def test_what_does_not_fit_is_refused(images):
+def test_invalid_input_of_patch_match_is_refused(images):
     planes = DepthPlanes.unknown(*images[0].grey.shape)
     with pytest.raises(ValueError, match="1 to 8 sources"):
         patch_match(images[0], [], planes, (0.0, 0.8), 1.0, 1)
@@ -167,7 +167,7 @@ def test_what_does_not_fit_is_refused(images):
 
 
 def slanted(height: int, width: int, inverse: float) -> np.ndarray:
-    """(3, H, W) a plane of inverse depth, `inverse` in the middle."""
+    """(3, H, W) a plane of inverse depth, with `inverse` in the centre."""
     right, down = 2e-3 * inverse, -1e-3 * inverse
     rows, columns = np.indices((height, width))
     values = inverse + right * (columns - width // 2) + down * (rows - height // 2)
@@ -188,7 +188,7 @@ def test_support_agrees_with_float64():
     assert not found[np.isnan(plane[0])].any()
 
 
-def test_a_plane_supports_all_of_its_pixels_at_any_slope():
+def test_pixels_of_a_plane_have_full_support():
     assert (support(np.full((24, 40), 90, np.uint8), slanted(24, 40, 0.3), 1e-4) == 1).all()
 
 
@@ -207,7 +207,7 @@ def test_support_ends_at_edges_of_the_photograph():
     assert (found[edge + halo : edge + 2 * halo] > 0.5).all() and (found[-CROSS_REACH:] == 1).all()
 
 
-def test_support_does_not_depend_on_the_threads():
+def test_support_does_not_depend_on_threads():
     rng = np.random.default_rng(4)
     grey = rng.integers(0, 60, (50, 70)).astype(np.uint8)
     plane = slanted(50, 70, 0.5) * (1 + 0.01 * rng.normal(size=(50, 70))).astype(np.float32)
@@ -221,13 +221,13 @@ def test_support_does_not_depend_on_the_threads():
     assert np.array_equal(*found)
 
 
-def test_arrays_that_do_not_fit_support_are_refused():
+def test_invalid_arrays_of_support_are_refused():
     with pytest.raises(ValueError, match=r"plane has shape \(3, 8, 9\), wanted \(3, 8, 8\)"):
         support(np.zeros((8, 8), np.uint8), np.zeros((3, 8, 9), np.float32), 0.01)
 
 
 def fitted(grey: np.ndarray, plane: np.ndarray, cost: np.ndarray | None = None, tolerance: float = 0.01) -> DepthPlanes:
-    """What `fit_surfaces` makes of (3, H, W) planes."""
+    """The result of `fit_surfaces` for (3, H, W) planes."""
     cost = np.full(grey.shape, 0.1, np.float32) if cost is None else cost
     planes = DepthPlanes(np.moveaxis(plane, 0, 2).copy(), cost.copy(), np.zeros(grey.shape, np.uint8))
     fit_surfaces(grey, planes, plane[0] > 0, tolerance)
@@ -250,8 +250,8 @@ def blotched(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 @pytest.mark.parametrize("kernels", KERNELS)
-def test_fitted_surfaces_have_the_same_bits_by_every_instruction_set(kernels):
-    """A comparison that a last digit turns over has a plane of its own, and so a wall."""
+def test_fitted_surfaces_are_bitwise_equal_for_all_instruction_sets(kernels):
+    """A comparison changed by rounding would select another plane and change the result visibly."""
     scene, before = blotched(61, 83), ops.instruction_set()
     try:
         ops.set_instruction_set("scalar")
@@ -271,17 +271,17 @@ def test_fitted_surfaces_agree_with_float64():
     assert np.quantile(relative, 0.98) < 2e-6 and relative.max() < 2e-3
     assert np.quantile(np.abs(found.plane[..., 1:] - np.moveaxis(wanted[1:], 0, 2)), 0.98) < 2e-6
     assert np.quantile(np.abs(found.cost - wanted_cost), 0.98) < 1e-5
-    # Of mistakes and gaps nearly all are gone.
+    # Most wrong and missing values are replaced.
     assert (np.abs(wanted[0] / plane[0].clip(1e-6) - 1) > 0.05).mean() > 0.25
 
 
-def test_planes_stay_planes():
+def test_fitting_keeps_planes():
     plane = slanted(24, 40, 0.3)
     found = fitted(np.full((24, 40), 90, np.uint8), plane)
     assert np.allclose(np.moveaxis(found.plane, 2, 0), plane, rtol=0, atol=1e-6)
 
 
-def test_noise_on_a_curved_surface_gets_less_and_the_curve_stays():
+def test_fitting_reduces_noise_on_a_curved_surface():
     rng, (rows, columns) = np.random.default_rng(6), np.indices((60, 60))
     # A ball of 40 pixels: 0.3 % nearer in the middle of a cross than at its ends.
     true = 0.5 + 0.5 * (np.sqrt(40**2 - (rows - 30.0) ** 2 * 0.5 - (columns - 30.0) ** 2 * 0.5) - 40) / 400
@@ -296,7 +296,7 @@ def test_noise_on_a_curved_surface_gets_less_and_the_curve_stays():
     assert np.std(found.plane[..., 1] - slopes[1]) < 1e-4 and np.std(found.plane[..., 2] - slopes[0]) < 1e-4
 
 
-def test_beyond_an_edge_of_the_photograph_the_surface_of_that_side_is_taken():
+def test_fitting_uses_the_surface_on_the_same_side_of_an_edge():
     height, width, edge, halo = 40, 60, 30, 5
     grey = np.full((height, width), 60, np.uint8)
     grey[:, edge:] = 60 + CROSS_GREY
@@ -310,7 +310,7 @@ def test_beyond_an_edge_of_the_photograph_the_surface_of_that_side_is_taken():
     assert np.allclose(found.cost[:, edge : edge + halo], 0.4) and np.allclose(found.cost[:, :edge], 0.2)
 
 
-def test_a_crease_within_one_brightness_stays_sharp():
+def test_fitting_keeps_a_crease_of_uniform_brightness():
     rng, (height, width) = np.random.default_rng(8), (40, 60)
     columns = np.arange(width) - 29.5
     # Two walls at a right angle, seen from 3 m, and noise of 0.03 %: within 1 % one surface of second order fits both.
@@ -324,7 +324,7 @@ def test_a_crease_within_one_brightness_stays_sharp():
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 30), (30, 1), (30, 2), (1, 1)])
-def test_narrow_images_are_fitted_as_in_float64(height, width):
+def test_fitting_narrow_images_agrees_with_float64(height, width):
     rng = np.random.default_rng(9)
     plane = slanted(height, width, 0.5)
     plane[0] *= 1 + 1e-3 * rng.normal(size=(height, width)).astype(np.float32)
@@ -333,7 +333,7 @@ def test_narrow_images_are_fitted_as_in_float64(height, width):
     assert np.allclose(np.moveaxis(found.plane, 2, 0), wanted, rtol=0, atol=2e-6)
 
 
-def test_a_thin_thing_that_the_photograph_tells_apart_stays():
+def test_fitting_keeps_a_thin_object_with_edges():
     height, width = 40, 60
     grey = np.full((height, width), 60, np.uint8)
     grey[:, 30:33] = 60 + CROSS_GREY
@@ -343,7 +343,7 @@ def test_a_thin_thing_that_the_photograph_tells_apart_stays():
     assert np.allclose(found.plane, np.moveaxis(plane, 0, 2), rtol=0, atol=1e-5)
 
 
-def test_without_half_of_a_cross_planes_stay():
+def test_fitting_keeps_planes_without_a_majority():
     rng = np.random.default_rng(7)
     plane = slanted(30, 30, 0.5)
     plane[0] *= rng.choice(np.array([0.8, 1, 1.2], np.float32), (30, 30))
@@ -352,7 +352,7 @@ def test_without_half_of_a_cross_planes_stay():
     assert np.array_equal(found.plane, np.moveaxis(plane, 0, 2))
 
 
-def test_fitted_surfaces_do_not_depend_on_the_threads():
+def test_fitted_surfaces_do_not_depend_on_threads():
     grey, plane, cost = blotched(50, 70)
     before, found = ops.threads(), []
     try:
@@ -364,7 +364,7 @@ def test_fitted_surfaces_do_not_depend_on_the_threads():
     assert np.array_equal(found[0].plane, found[1].plane) and np.array_equal(found[0].cost, found[1].cost)
 
 
-def test_arrays_that_do_not_fit_surfaces_are_refused():
+def test_invalid_arrays_of_fit_surfaces_are_refused():
     planes = DepthPlanes.unknown(8, 9)
     with pytest.raises(ValueError, match=r"plane has shape \(3, 8, 9\), wanted \(3, 8, 8\)"):
         fit_surfaces(np.zeros((8, 8), np.uint8), planes, np.ones((8, 9), bool), 0.01)
