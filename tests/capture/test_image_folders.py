@@ -1,4 +1,4 @@
-"""Photographs in other sizes: a folder that is named, and the smaller ones that Mip-NeRF 360 brings."""
+"""Photographs of other sizes: a folder named by `--images`, and the smaller ones of Mip-NeRF 360."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def shrink(root, folder, size, count=6, suffix=".png"):
 
 
 @pytest.mark.parametrize("write", [write_colmap, write_transforms])
-def test_smaller_photographs_take_the_place_of_averages(tmp_path, write):
+def test_folders_of_smaller_photographs_replace_averaging(tmp_path, write):
     write(tmp_path, 6)
     averaged = {view.name: view for view in load_scene(tmp_path, downscale=4).views}
     shrink(tmp_path, "images_4", (8, 6))
@@ -33,7 +33,7 @@ def test_smaller_photographs_take_the_place_of_averages(tmp_path, write):
         assert view.load().rgb.shape == (12, 16, 3) and view.image_path.parent.name == "images"
 
 
-def test_rounded_sizes_scale_each_axis_by_what_it_is(tmp_path):
+def test_rounded_sizes_scale_each_axis_separately(tmp_path):
     write_colmap(tmp_path, 6)
     shrink(tmp_path, "images_5", (6, 5))  # of 6.4 x 4.8
     view = load_scene(tmp_path, downscale=5).train[0]
@@ -45,7 +45,7 @@ def test_rounded_sizes_scale_each_axis_by_what_it_is(tmp_path):
     )
 
 
-def test_lenses_are_scaled_with_them(tmp_path):
+def test_lenses_are_scaled_with_smaller_photographs(tmp_path):
     write_colmap(tmp_path, 6, model="SIMPLE_RADIAL", params=[30.0, 16.0, 12.0, -0.1])
     shrink(tmp_path, "images_2", (16, 12))
     view = load_scene(tmp_path, downscale=2).train[0]
@@ -53,7 +53,7 @@ def test_lenses_are_scaled_with_them(tmp_path):
 
 
 @pytest.mark.parametrize("problem", ["one missing", "another size", "masks"])
-def test_what_does_not_fit_is_averaged_as_ever(tmp_path, problem):
+def test_incomplete_or_masked_folders_fall_back_to_averaging(tmp_path, problem):
     write_colmap(tmp_path, 6)
     shrink(tmp_path, "images_2", (16, 12))
     if problem == "one missing":
@@ -69,7 +69,7 @@ def test_what_does_not_fit_is_averaged_as_ever(tmp_path, problem):
 
 
 @pytest.mark.parametrize("write", [write_colmap, write_transforms])
-def test_a_folder_that_is_named_is_used_in_its_size(tmp_path, write):
+def test_a_named_folder_is_used_at_its_size(tmp_path, write):
     cameras = write(tmp_path, 6)
     cameras = cameras[0] if isinstance(cameras, tuple) else cameras
     shrink(tmp_path, "photos", (64, 48), suffix=".jpg")
@@ -82,13 +82,13 @@ def test_a_folder_that_is_named_is_used_in_its_size(tmp_path, write):
     assert load_scene(tmp_path, images="photos", downscale=4).train[0].load().rgb.shape == (12, 16, 3)
 
 
-def test_a_named_folder_is_enough_for_a_model(tmp_path):
+def test_a_named_folder_replaces_missing_images(tmp_path):
     write_colmap(tmp_path, 6)
     shutil.move(tmp_path / "images", tmp_path / "original")
     assert len(load_scene(tmp_path, images="original").views) == 6
 
 
-def test_named_folders_that_do_not_fit_are_refused(tmp_path):
+def test_named_folders_that_do_not_match_are_refused(tmp_path):
     write_colmap(tmp_path, 6)
     shrink(tmp_path, "photos", (16, 12))
     picture(0, (16, 16)).save(tmp_path / "photos" / "02.png")

@@ -1,5 +1,4 @@
-"""What `load_scene` makes of a folder: layouts, splits, masks, downscaling, names, and one sentence for
-what is broken."""
+"""`load_scene`: layouts, splits, masks, downscaling, names, and errors for invalid captures."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ def test_every_eighth_by_name_is_held_out(tmp_path):
 
 @pytest.mark.parametrize(("every", "held_out"), [(0, []), (3, ["00", "03", "06", "09"]), (100, ["00"])])
 @pytest.mark.parametrize("named", [False, True])
-def test_a_number_holds_out_every_so_many_whatever_the_data_set_names(every, held_out, named, tmp_path):
+def test_test_every_overrides_the_split_of_the_data_set(every, held_out, named, tmp_path):
     write_transforms(tmp_path, 10)
     if named:
         edit(tmp_path / "transforms.json", lambda content: content.update(test_filenames=["images/05.png"]))
@@ -45,7 +44,7 @@ def test_a_number_holds_out_every_so_many_whatever_the_data_set_names(every, hel
     assert [view.name for view in scene.test] == held_out and len(scene.train) == 10 - len(held_out)
 
 
-def test_a_number_that_leaves_nothing_to_train_on_is_one_sentence(tmp_path):
+def test_invalid_test_every_is_refused(tmp_path):
     write_transforms(tmp_path, 10)
     with pytest.raises(LinprimError, match="--test-every 1 leaves 0 of 10 photographs to train on"):
         load_scene(tmp_path, test_every=1)
@@ -59,13 +58,13 @@ def test_the_split_does_not_depend_on_the_order_of_frames(tmp_path):
     assert [view.name for view in load_scene(tmp_path).test] == ["00", "08"]
 
 
-def test_two_images_are_both_trained_on(tmp_path):
+def test_two_images_are_both_used_for_training(tmp_path):
     write_transforms(tmp_path, 2)
     scene = load_scene(tmp_path)
     assert len(scene.train) == 2 and not scene.test
 
 
-def test_test_file_wins_over_val_and_nerf_synthetic_side_images_are_no_views(tmp_path):
+def test_test_split_has_precedence_over_val_and_side_images_are_no_views(tmp_path):
     cameras = ring(6)
     for split, indices in (("train", [0, 1, 2]), ("val", [3]), ("test", [4, 5])):
         (tmp_path / split).mkdir()
@@ -87,7 +86,7 @@ def test_test_file_wins_over_val_and_nerf_synthetic_side_images_are_no_views(tmp
     assert [view.name for view in load_scene(tmp_path).test] == ["val_r_0"]
 
 
-def test_a_test_file_without_frames_says_that_nothing_is_held_out(tmp_path):
+def test_an_empty_test_file_means_no_held_out_views(tmp_path):
     write_transforms(tmp_path, 10, name="transforms_train.json")
     assert len(load_scene(tmp_path).test) == 2
     (tmp_path / "transforms_test.json").write_text('{"frames": []}')
@@ -157,14 +156,14 @@ def test_masks_option_and_its_errors(tmp_path):
     assert "--masks nowhere: no such folder" in refusal(tmp_path / "scene", masks="nowhere")
 
 
-def test_a_mask_folder_of_something_else_is_left_alone(tmp_path):
+def test_mask_folders_without_images_are_ignored(tmp_path):
     write_transforms(tmp_path, 3)
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks" / "readme.txt").write_text("none yet")
     assert not load_scene(tmp_path).has_alpha
 
 
-def test_depth_is_scaled_z_and_zero_where_there_is_none(tmp_path):
+def test_depth_is_scaled_and_zero_where_unknown(tmp_path):
     write_transforms(tmp_path, 3, depth_unit_scale_factor=0.001)
     depth = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)
     Image.fromarray(depth).save(tmp_path / "d.png")
@@ -197,7 +196,7 @@ def test_colmap_and_transforms_of_the_same_cameras_agree(tmp_path):
         np.testing.assert_array_equal(a.load().rgb, b.load().rgb)
 
 
-def test_equal_stems_get_names_of_their_own(tmp_path):
+def test_equal_stems_get_distinct_names(tmp_path):
     cameras = ring(4)
     paths = ["a/0.png", "a/0.jpg", "b/0.png", "b/1.png"]
     for i, path in enumerate(paths):
@@ -208,7 +207,7 @@ def test_equal_stems_get_names_of_their_own(tmp_path):
     assert names == {"a_0.png", "a_0.jpg", "b_0.png", "b_1.png"}
 
 
-def test_folders_that_are_no_capture(tmp_path):
+def test_folders_without_a_capture_are_refused(tmp_path):
     assert "no such folder" in refusal(tmp_path / "nothing")
     assert "no photographs (the folder is empty)" in refusal(tmp_path)
     (tmp_path / "photos").mkdir()
@@ -218,7 +217,7 @@ def test_folders_that_are_no_capture(tmp_path):
     assert "a file, wanted the folder" in refusal(tmp_path / "photos" / "a.png")
 
 
-def test_images_that_are_missing_damaged_or_of_another_size(tmp_path):
+def test_missing_damaged_or_wrongly_sized_images_are_refused(tmp_path):
     write_transforms(tmp_path, 4)
     image = tmp_path / "images" / "02.png"
     content = image.read_bytes()
@@ -236,7 +235,7 @@ def test_images_that_are_missing_damaged_or_of_another_size(tmp_path):
         view.load()
 
 
-def test_a_photograph_turned_by_exif_is_turned_to_fit_its_camera(tmp_path):
+def test_photographs_rotated_by_exif_are_rotated_to_fit_their_camera(tmp_path):
     write_transforms(tmp_path, 3)
     pixels = np.asarray(picture(1))
     exif = Image.Exif()
@@ -252,7 +251,7 @@ def test_one_image_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("longest", "factor"), [(40, 1), (32, 1), (31, 2), (16, 2), (11, 3)])
-def test_large_photographs_are_averaged_down_unless_a_number_is_given(longest, factor, tmp_path, monkeypatch):
+def test_large_photographs_are_averaged_down_by_default(longest, factor, tmp_path, monkeypatch):
     write_transforms(tmp_path, 3)  # 32 by 24 pixels
     monkeypatch.setattr(load, "LONGEST_SIDE", longest)
     scene = load_scene(tmp_path)
@@ -261,7 +260,7 @@ def test_large_photographs_are_averaged_down_unless_a_number_is_given(longest, f
     assert load_scene(tmp_path, downscale=1).train[0].camera.width == 32
 
 
-def test_the_longest_side_of_all_photographs_counts(tmp_path, monkeypatch):
+def test_automatic_downscale_uses_the_longest_side_of_all_photographs(tmp_path, monkeypatch):
     write_transforms(tmp_path, 3)
     tall = np.zeros((64, 48, 3), np.uint8)
     Image.fromarray(tall).save(tmp_path / "images" / "tall.png")
@@ -275,7 +274,7 @@ def test_the_longest_side_of_all_photographs_counts(tmp_path, monkeypatch):
     assert {(view.camera.width, view.camera.height) for view in load_scene(tmp_path).views} == {(16, 12), (24, 32)}
 
 
-def test_what_was_averaged_down_is_told_if_nobody_asked_for_it(tmp_path, monkeypatch):
+def test_automatic_downscale_is_reported(tmp_path, monkeypatch):
     write_transforms(tmp_path, 3)
     monkeypatch.setattr(load, "LONGEST_SIDE", 16)
     for options, told in ((SceneOptions(), 1), (SceneOptions(downscale=2), 0), (SceneOptions(downscale=1), 0)):
@@ -293,7 +292,7 @@ def test_downscale_must_be_a_whole_number(tmp_path, value):
     assert f"--downscale is {value}, wanted " in refusal(tmp_path, downscale=value)
 
 
-def test_downscale_that_leaves_nothing(tmp_path):
+def test_downscale_to_nothing_is_refused(tmp_path):
     write_transforms(tmp_path, 3)
     assert "leaves nothing" in refusal(tmp_path, downscale=25)
 
@@ -314,7 +313,7 @@ def bad_poses():
 
 
 @pytest.mark.parametrize("said", list(bad_poses()))
-def test_poses_that_are_not_rigid(tmp_path, said):
+def test_poses_that_are_not_rigid_are_refused(tmp_path, said):
     write_transforms(tmp_path, 3)
     pose = bad_poses()[said]
     edit(tmp_path / "transforms.json", lambda c: c["frames"][1].update(transform_matrix=pose.tolist()))
@@ -322,7 +321,7 @@ def test_poses_that_are_not_rigid(tmp_path, said):
     assert said in message and "frame 1 (images/01.png)" in message
 
 
-def test_rounded_poses_become_orthonormal():
+def test_rounded_poses_are_made_orthonormal():
     camera = ring(5)[2]
     rounded = np.round(camera.camera_to_world @ OPENGL, 4)
     pose = check_pose(rounded, "here")
@@ -330,7 +329,7 @@ def test_rounded_poses_become_orthonormal():
     np.testing.assert_allclose(pose, rounded, atol=2e-4)  # a few times the rounding of half a digit
 
 
-def test_a_copy_of_the_folder_is_read_from_where_it_is(tmp_path):
+def test_a_moved_folder_is_read_from_its_new_place(tmp_path):
     write_transforms(tmp_path / "a", 3)
     shutil.move(tmp_path / "a", tmp_path / "b")
     assert all(view.image_path.is_relative_to(tmp_path / "b") for view in load_scene(tmp_path / "b").views)

@@ -1,5 +1,5 @@
-"""Whether a reconstruction's poses agree with the matches that it was made from: against exact poses, against poses
-that are wrong by design, and where mapping itself goes wrong because things look the same."""
+"""Agreement of a reconstruction's poses with its matches: for exact poses, for wrong poses, and for wrong maps of
+scenes with repeated structure."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_true_poses_agree_with_every_match(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("wrong", ["turned", "moved", "opposite"])
-def test_the_photograph_that_is_misplaced_is_found(seed, wrong):
+def test_a_misplaced_photograph_is_found(seed, wrong):
     poses, pairs = exact(seed)
     turn = Rotation.from_rotvec([0.1, 0, 0] if wrong == "turned" else [0, 0, 0]).as_matrix()
     center = {"turned": [1.2, 0, 0], "moved": [1.2, 1, 0], "opposite": [-3, 0, 0]}[wrong]
@@ -85,7 +85,7 @@ def test_matches_agree_up_to_four_pixels(miss, agree):
 
 
 def mapped(folder, patches: int, seed: int) -> tuple[bool, list[int]]:
-    """Whether mapping turns all photographs as they are, and those that are misplaced."""
+    """Whether mapping recovers all rotations, and the photographs that are reported as misplaced."""
     truth = write_matches(folder / f"{seed}.db", patches, seed)
     model, misplaced = _map(folder / f"{seed}.db", folder, folder, 1, COUNT, lambda line: None)
     rotations = [model.image(n).cam_from_world().rotation.matrix() for n in model.reg_image_ids()]
@@ -94,11 +94,11 @@ def mapped(folder, patches: int, seed: int) -> tuple[bool, list[int]]:
     return np.degrees(Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude().max()) < 2, misplaced
 
 
-def test_where_nothing_is_there_twice_mapping_is_right_and_no_photograph_is_named(tmp_path):
+def test_no_photograph_is_reported_without_repeated_structure(tmp_path):
     assert mapped(tmp_path, patches=0, seed=0) == (True, [])
 
 
-def test_what_mapping_glues_together_wrongly_is_told(tmp_path):
+def test_wrong_maps_by_repeated_structure_are_reported(tmp_path):
     # Of 23 such rings mapping turned 13 wrongly, of which 12 were told, and no right one was.
     results = [mapped(tmp_path, patches=3, seed=seed) for seed in range(6)]
     told = [bool(misplaced) for right, misplaced in results if not right]

@@ -1,4 +1,4 @@
-"""COLMAP models, binary and text, with and without rigs: what is read, and how every damage is named."""
+"""COLMAP models, binary and text, with and without rigs: contents, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_sparse_option_names_a_model_elsewhere(tmp_path):
     assert "no cameras.bin or cameras.txt" in refusal(tmp_path, sparse="images")
 
 
-def test_a_distorted_camera_becomes_a_pinhole_of_its_own_size(tmp_path):
+def test_images_of_a_distorted_camera_are_undistorted_to_a_pinhole(tmp_path):
     write_colmap(tmp_path, 3, model="SIMPLE_RADIAL", params=[30.0, 16.0, 12.0, -0.1])
     view = load_scene(tmp_path, cache=tmp_path / "cache").train[0]
     assert view.lens.model == "SIMPLE_RADIAL" and view.file_size == (32, 24)
@@ -120,7 +120,7 @@ def test_truncated_tables_are_named(tmp_path, table, text):
         assert refusal(tmp_path)
 
 
-def test_bytes_after_the_last_record(tmp_path):
+def test_trailing_bytes_are_refused(tmp_path):
     write_colmap(tmp_path, 3)
     with open(tmp_path / "sparse/0/images.bin", "ab") as file:
         file.write(b"\0\0\0\0\0")
@@ -128,13 +128,13 @@ def test_bytes_after_the_last_record(tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["cameras", "images", "points3D"])
-def test_a_table_that_is_not_there(tmp_path, missing):
+def test_missing_tables_are_named(tmp_path, missing):
     write_colmap(tmp_path, 3)
     (tmp_path / f"sparse/0/{missing}.bin").unlink()
     assert f"lacks {missing}" in refusal(tmp_path)
 
 
-def test_unknown_camera_models(tmp_path):
+def test_unknown_camera_models_are_refused(tmp_path):
     write_colmap(tmp_path / "a", 3)
     file = tmp_path / "a/sparse/0/cameras.bin"
     content = bytearray(file.read_bytes())
@@ -147,7 +147,7 @@ def test_unknown_camera_models(tmp_path):
     assert "unknown camera model PANORAMIX" in refusal(tmp_path / "b")
 
 
-def test_a_pose_with_nan(tmp_path):
+def test_poses_with_nan_are_refused(tmp_path):
     write_colmap(tmp_path, 3)
     for name in ("rigs", "frames"):
         (tmp_path / f"sparse/0/{name}.bin").unlink()
@@ -158,7 +158,7 @@ def test_a_pose_with_nan(tmp_path):
     assert "not finite numbers" in refusal(tmp_path)
 
 
-def test_an_empty_reconstruction(tmp_path):
+def test_an_empty_reconstruction_is_refused(tmp_path):
     (tmp_path / "sparse/0").mkdir(parents=True)
     reconstruction([], [], []).write_binary(str(tmp_path / "sparse/0"))
     assert "reconstruction is empty" in refusal(tmp_path)
@@ -169,7 +169,7 @@ def test_a_model_without_points_is_a_scene_without_points(tmp_path):
     assert load_scene(tmp_path).points is None
 
 
-def test_registered_images_that_are_not_on_disk(tmp_path):
+def test_registered_images_missing_on_disk_are_named(tmp_path):
     write_colmap(tmp_path, 5)
     for name in ("01", "03"):
         (tmp_path / "images" / f"{name}.png").unlink()
@@ -177,13 +177,13 @@ def test_registered_images_that_are_not_on_disk(tmp_path):
     assert "2 of the 5 images" in message and "the first is 01.png" in message
 
 
-def test_images_that_are_not_registered_are_no_views(tmp_path):
+def test_unregistered_images_are_no_views(tmp_path):
     write_colmap(tmp_path, 3)
     picture(9).save(tmp_path / "images" / "extra.png")
     assert len(load_scene(tmp_path).views) == 3
 
 
-def test_reading_a_model_by_itself(tmp_path):
+def test_read_model_reads_images_and_points(tmp_path):
     _, xyz = write_colmap(tmp_path, 3)
     model = read_model(find_model(tmp_path))
     assert [image.name for image in model.images] == ["00.png", "01.png", "02.png"]

@@ -1,5 +1,4 @@
-"""DTU scans as NeuS and IDR lay them out: projections are taken apart into the cameras they were made of, damage is
-named."""
+"""DTU scans in the layout of NeuS and IDR: decomposition of projection matrices, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -53,7 +52,7 @@ def refusal(path) -> str:
     "layout",
     [{}, {"images": "images", "masks": "masks", "name": "cameras.npz"}, {"masks": None}, {"smaller": 4}],
 )
-def test_cameras_are_those_that_the_matrices_were_made_of(tmp_path, layout):
+def test_cameras_are_recovered_from_projection_matrices(tmp_path, layout):
     cameras = write_dtu(tmp_path, **layout)
     scene = load_scene(tmp_path)
     assert (
@@ -74,7 +73,7 @@ def test_cameras_are_those_that_the_matrices_were_made_of(tmp_path, layout):
             assert (photo.alpha[0] > 0).sum() == 8 + int(view.name)
 
 
-def test_a_factor_or_sign_of_a_projection_does_not_matter():
+def test_decomposition_ignores_factor_and_sign():
     camera = ring(3)[1]
     projection = camera.K @ camera.world_to_camera[:3]
     for factor in (1.0, -1.0, -7.0, 1e-3):
@@ -133,7 +132,7 @@ def test_missing_images_and_masks_are_counted(tmp_path):
     assert "no images, wanted a folder image or images" in refusal(tmp_path)
 
 
-def test_a_file_that_is_cut_short(tmp_path):
+def test_truncated_files_are_refused(tmp_path):
     write_dtu(tmp_path)
     file = tmp_path / "cameras_sphere.npz"
     file.write_bytes(file.read_bytes()[:500])

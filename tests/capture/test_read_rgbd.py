@@ -1,5 +1,5 @@
-"""RGB-D sequences of Redwood, Open3D and TUM, and Tanks and Temples' trajectories: which pose, depth map and pinhole
-belong to a photograph."""
+"""RGB-D sequences of Redwood, Open3D and TUM, and trajectories of Tanks and Temples: pose, depth map and camera of each
+photograph."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_redwood_frames_have_their_pose_depth_and_pinhole(tmp_path, color, depth
         assert depth[0, 0] == 0 and depth[1, 1] == pytest.approx(1 + 0.25 * index)
 
 
-def test_without_a_file_the_camera_is_the_primesense(tmp_path):
+def test_the_default_camera_is_the_primesense(tmp_path):
     write_redwood(tmp_path, 3, size=SIZE)
     camera = load_scene(tmp_path).train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (525, 525, 320, 240)
@@ -96,7 +96,7 @@ def test_without_a_file_the_camera_is_the_primesense(tmp_path):
     assert "the image is 320x240, wanted 640x480 as the PrimeSense had" in refusal(tmp_path)
 
 
-def test_fewer_photographs_than_poses_are_named_by_the_number_of_their_pose(tmp_path):
+def test_fewer_photographs_than_poses_are_matched_by_number(tmp_path):
     cameras = write_redwood(tmp_path, 7)
     for i in (1, 3, 5):
         (tmp_path / "image" / f"{i:05d}.jpg").unlink()
@@ -109,7 +109,7 @@ def test_fewer_photographs_than_poses_are_named_by_the_number_of_their_pose(tmp_
     assert "7 poses for 4 images, such as two.jpg" in refusal(tmp_path)
 
 
-def test_more_photographs_than_poses_are_counted(tmp_path):
+def test_more_photographs_than_poses_are_matched_by_number(tmp_path):
     cameras = write_redwood(tmp_path, 6)
     (tmp_path / "trajectory.log").write_text(log(cameras[1::2], [1, 3, 5]))
     views = load_scene(tmp_path).views
@@ -137,7 +137,7 @@ def test_damaged_trajectories_are_named(tmp_path, content, words):
     assert words in message and "trajectory.log" in message
 
 
-def test_missing_depth_maps_and_broken_intrinsics(tmp_path):
+def test_missing_depth_maps_and_invalid_intrinsics_are_refused(tmp_path):
     write_redwood(tmp_path, 4)
     (tmp_path / "depth" / "00002.png").unlink()
     assert "3 depth maps for 4 images" in refusal(tmp_path)
@@ -173,7 +173,7 @@ def test_tum_photographs_get_the_nearest_pose_and_depth(tmp_path):
         assert view.load_depth()[1, 1] == pytest.approx(1 + 0.25 * index, abs=1e-4)
 
 
-def test_tum_photographs_without_a_pose_are_left_out_and_without_depth_stay(tmp_path):
+def test_tum_photographs_need_a_pose_but_no_depth(tmp_path):
     write_tum(tmp_path)
     lines = (tmp_path / "groundtruth.txt").read_text().splitlines()
     (tmp_path / "groundtruth.txt").write_text("\n".join(lines[:1] + lines[3:]))
@@ -206,7 +206,7 @@ def test_damaged_tum_lists_are_named(tmp_path):
     assert len(load_scene(tmp_path).views) == 3
 
 
-def test_tum_photographs_may_lie_anywhere(tmp_path):
+def test_tum_lists_may_have_absolute_paths(tmp_path):
     write_tum(tmp_path / "lists")
     text = (tmp_path / "lists" / "rgb.txt").read_text()
     (tmp_path / "lists" / "rgb.txt").write_text(text.replace(" rgb/", f" {tmp_path}/photos/"))
@@ -214,13 +214,13 @@ def test_tum_photographs_may_lie_anywhere(tmp_path):
     assert len(load_scene(tmp_path / "lists").views) == 6
 
 
-def test_the_nearest_of_sorted_moments():
+def test_nearest_finds_timestamps_within_a_limit():
     found = nearest(np.array([0.0, 1.0, 2.0]), np.array([-0.3, 0.4, 0.6, 1.0, 9.0]), 0.45)
     np.testing.assert_array_equal(found, [0, 0, 1, 1, -1])
 
 
 @pytest.mark.parametrize("folder", ["images", "Barn", "."])
-def test_tanks_and_temples_by_its_trajectory(tmp_path, folder):
+def test_tanks_and_temples_is_read_by_its_trajectory(tmp_path, folder):
     cameras = ring(8)
     (tmp_path / folder).mkdir(exist_ok=True)
     for i in range(8):
@@ -236,7 +236,7 @@ def test_tanks_and_temples_by_its_trajectory(tmp_path, folder):
         assert (view.camera.fx, view.camera.cx) == (30, 16)
 
 
-def test_a_camera_wider_than_a_name_of_a_folder_is_long_is_one_sentence(tmp_path):
+def test_an_absurd_image_width_is_refused(tmp_path):
     (tmp_path / "images").mkdir()
     for i in range(8):
         picture(i).save(tmp_path / "images" / f"{i + 1:06d}.jpg")

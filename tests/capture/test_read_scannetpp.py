@@ -1,4 +1,4 @@
-"""ScanNet++ scenes in their layout: which images, cameras and split are taken, in whose frame, and what is refused."""
+"""ScanNet++ scenes: images, cameras, split and coordinate frame, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def check(scene, cameras):
 
 
 @pytest.mark.parametrize("inside", [".", "dslr"])
-def test_the_fisheye_images_with_the_poses_of_colmap(tmp_path, inside):
+def test_fisheye_images_are_read_with_colmap_poses(tmp_path, inside):
     cameras, xyz = write_dslr(tmp_path, undistorted=True)
     scene = load_scene(tmp_path / inside)
     check(scene, cameras)
@@ -90,7 +90,7 @@ def test_the_fisheye_images_with_the_poses_of_colmap(tmp_path, inside):
 
 
 @pytest.mark.parametrize("colmap", [True, False])
-def test_undistorted_images_have_cameras_of_their_own(tmp_path, colmap):
+def test_undistorted_images_have_separate_cameras(tmp_path, colmap):
     cameras, _ = write_dslr(tmp_path, distorted=False, undistorted=True, colmap=colmap)
     scene = load_scene(tmp_path)
     check(scene, cameras)
@@ -98,12 +98,12 @@ def test_undistorted_images_have_cameras_of_their_own(tmp_path, colmap):
     assert (scene.points is not None) == colmap
 
 
-def test_without_colmap_nerfstudios_poses_are_turned_back(tmp_path):
+def test_nerfstudio_poses_are_transformed_to_the_frame_of_colmap(tmp_path):
     cameras, _ = write_dslr(tmp_path, colmap=False)
     check(load_scene(tmp_path), cameras)
 
 
-def test_the_phone_has_no_split_of_its_own(tmp_path):
+def test_phone_captures_use_the_default_split(tmp_path):
     cameras, phone = ring(9), tmp_path / "iphone"
     names = [f"frame_{i * 10:06d}.jpg" for i in range(9)]
     for folder in ("rgb", "colmap"):
@@ -123,7 +123,7 @@ def test_the_phone_has_no_split_of_its_own(tmp_path):
             )
 
 
-def test_images_of_the_benchmark_that_are_not_given_out_are_no_error_but_others_are(tmp_path):
+def test_only_missing_test_images_are_accepted(tmp_path):
     write_dslr(tmp_path)
     (tmp_path / "dslr/resized_images/DSC00008.JPG").unlink()
     scene = load_scene(tmp_path)
@@ -135,7 +135,7 @@ def test_images_of_the_benchmark_that_are_not_given_out_are_no_error_but_others_
 
 @pytest.mark.parametrize("distorted", [True, False])
 @pytest.mark.parametrize("colmap", [True, False])
-def test_images_that_are_marked_bad_are_left_out(tmp_path, distorted, colmap):
+def test_images_marked_bad_are_left_out(tmp_path, distorted, colmap):
     write_dslr(tmp_path, distorted=distorted, undistorted=not distorted, colmap=colmap)
     path = tmp_path / "dslr/nerfstudio" / ("transforms.json" if distorted else "transforms_undistorted.json")
     header = json.loads(path.read_text())

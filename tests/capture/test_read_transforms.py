@@ -1,5 +1,4 @@
-"""`transforms*.json`: cameras and side files of the dialects, points that belong to them, and broken files
-by name."""
+"""`transforms*.json`: cameras and side files of all dialects, their points, and errors for damaged files."""
 
 from __future__ import annotations
 
@@ -24,7 +23,7 @@ def refusal(path, **options) -> str:
     return message
 
 
-def test_opengl_poses_look_where_they_say(tmp_path):
+def test_opengl_poses_are_converted(tmp_path):
     # camera-to-world = identity in OpenGL axes: at the origin, x right, y up, looking along -z
     write_transforms(tmp_path, 3)
     edit(tmp_path / "transforms.json", lambda c: c["frames"][1].update(transform_matrix=np.eye(4).tolist()))
@@ -34,7 +33,7 @@ def test_opengl_poses_look_where_they_say(tmp_path):
     np.testing.assert_allclose(pixels, [[16, 12], [16 + 15, 12], [16, 12 - 15]])
 
 
-def test_intrinsics_per_frame_win_over_those_of_the_file(tmp_path):
+def test_intrinsics_per_frame_override_those_of_the_file(tmp_path):
     write_transforms(tmp_path, 4)
     picture(1, size=(40, 20)).save(tmp_path / "images" / "01.png")
     own = {"w": 40, "h": 20, "fl_x": 50.0, "fl_y": 51.0, "cx": 19.0, "cy": 11.0}
@@ -45,7 +44,7 @@ def test_intrinsics_per_frame_win_over_those_of_the_file(tmp_path):
     assert cameras["02"].fx == 30
 
 
-def test_view_angles_and_sizes_from_the_image_header(tmp_path):
+def test_intrinsics_from_view_angles_and_image_size(tmp_path):
     write_transforms(tmp_path, 3)
 
     def only_angles(content):
@@ -71,7 +70,7 @@ def test_view_angles_and_sizes_from_the_image_header(tmp_path):
         ({"camera_model": "OPENCV", "k1": 0, "k2": 0.0}, None, ()),
     ],
 )
-def test_distortion_keys(tmp_path, keys, model, params):
+def test_distortion_keys_select_the_lens_model(tmp_path, keys, model, params):
     write_transforms(tmp_path, 3, **keys)
     lens = load_scene(tmp_path).train[0].lens
     if model is None:
@@ -80,9 +79,8 @@ def test_distortion_keys(tmp_path, keys, model, params):
         assert lens.model == model and lens.params == (30, 30, 16, 12, *params)
 
 
-def test_what_instant_ngp_writes(tmp_path):
-    """Its script's keys: one lens for all, whole numbers as floats, sharpness per image, and a cube that nothing else
-    asks for."""
+def test_files_of_instant_ngp_are_read(tmp_path):
+    """Files of its script have one lens, integers as floats, the sharpness of images, and `aabb_scale`."""
     cameras = ring(5)
     content = transforms(cameras, [f"./images/{i:04d}.png" for i in range(5)])
     angles = {"camera_angle_x": 2 * math.atan(16 / 30), "camera_angle_y": 2 * math.atan(12 / 30)}
@@ -100,7 +98,7 @@ def test_what_instant_ngp_writes(tmp_path):
         np.testing.assert_allclose(view.camera.world_to_camera, cameras[int(view.name)].world_to_camera, atol=1e-12)
 
 
-def test_frames_that_are_marked_bad_are_left_out(tmp_path):
+def test_frames_marked_bad_are_left_out(tmp_path):
     write_transforms(tmp_path, 6)
     path = tmp_path / "transforms.json"
     edit(path, lambda c: [frame.update(is_bad=i in (1, 4)) for i, frame in enumerate(c["frames"])])
@@ -112,7 +110,7 @@ def test_frames_that_are_marked_bad_are_left_out(tmp_path):
     assert "all 6 frames are marked 'is_bad'" in refusal(tmp_path)
 
 
-def test_named_splits_of_nerfstudio(tmp_path):
+def test_named_splits_of_nerfstudio_are_used(tmp_path):
     write_transforms(
         tmp_path, 6, train_filenames=["images/00.png"], test_filenames=["images/02.png", "./images/05.png"]
     )
@@ -120,7 +118,7 @@ def test_named_splits_of_nerfstudio(tmp_path):
     assert [view.name for view in scene.test] == ["02", "05"] and len(scene.train) == 4
 
 
-def test_held_out_frames_in_a_list_of_their_own(tmp_path):
+def test_test_frames_are_held_out(tmp_path):
     write_transforms(tmp_path, 6)
     edit(tmp_path / "transforms.json", lambda c: c.update(test_frames=[c["frames"].pop(3)]))
     scene = load_scene(tmp_path)
@@ -133,7 +131,7 @@ def test_a_named_file_is_read_instead(tmp_path):
     assert len(load_scene(tmp_path / "other.json").views) == 3
 
 
-def test_mask_paths_of_frames(tmp_path):
+def test_mask_paths_of_frames_are_used(tmp_path):
     write_transforms(tmp_path, 3)
     mask = np.zeros((24, 32), np.uint8)
     mask[3:9] = 255
@@ -172,7 +170,7 @@ RGB = np.random.default_rng(4).integers(0, 256, (20, 3), dtype=np.uint8)
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 @pytest.mark.parametrize("colors", [RGB, (RGB / 255).astype(np.float32), None])
-def test_points_of_every_ply_encoding(tmp_path, kind, colors):
+def test_points_of_every_ply_encoding_are_read(tmp_path, kind, colors):
     write_ply(tmp_path / "p.ply", XYZ, colors, kind)
     cloud = read_points_ply(tmp_path / "p.ply")
     np.testing.assert_allclose(cloud.xyz, XYZ, rtol=1e-6)
@@ -193,7 +191,7 @@ def test_truncated_points_are_refused(tmp_path, kind):
     assert "'ply_file_path'" in refusal(tmp_path) and "not on disk" in refusal(tmp_path)
 
 
-def test_points_that_are_not_finite_are_left_out(tmp_path):
+def test_non_finite_points_are_left_out(tmp_path):
     xyz = XYZ.copy()
     xyz[3, 1] = np.nan
     write_ply(tmp_path / "p.ply", xyz, RGB)
@@ -223,7 +221,7 @@ def test_points_come_from_the_model_whose_cameras_agree(tmp_path):
 
 
 @pytest.mark.parametrize("scale", [None, 2.5])
-def test_applied_transform_and_scale_take_colmap_points_along(tmp_path, scale):
+def test_applied_transform_and_scale_apply_to_colmap_points(tmp_path, scale):
     turn = np.array([[0.0, 1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, -1, 0.1]])  # as nerfstudio exchanges axes
     header = {} if scale is None else {"applied_scale": scale}
     cameras = write_transforms(tmp_path, 5, applied_transform=turn.tolist(), **header)
@@ -239,7 +237,7 @@ def test_applied_transform_and_scale_take_colmap_points_along(tmp_path, scale):
     np.testing.assert_allclose(load_scene(tmp_path).points.xyz, wanted, atol=1e-6)
 
 
-def test_a_damaged_model_that_nobody_asked_for_stops_nobody(tmp_path):
+def test_damaged_models_are_ignored_unless_requested(tmp_path):
     cameras = write_transforms(tmp_path, 3)
     write_model(tmp_path / "sparse/0", cameras, [f"{i:02d}.png" for i in range(3)], XYZ)
     file = tmp_path / "sparse/0/points3D.bin"
@@ -277,14 +275,14 @@ def test_a_damaged_model_that_nobody_asked_for_stops_nobody(tmp_path):
         (lambda c: c.update(test_filenames="images/00.png"), "is not a list of paths"),
     ],
 )
-def test_what_is_wrong_with_the_json_is_said(tmp_path, change, said):
+def test_invalid_entries_are_named(tmp_path, change, said):
     write_transforms(tmp_path, 3)
     edit(tmp_path / "transforms.json", change)
     message = refusal(tmp_path)
     assert said in message and str(tmp_path) in message
 
 
-def test_json_that_breaks_off(tmp_path):
+def test_invalid_json_is_refused(tmp_path):
     write_transforms(tmp_path, 3)
     file = tmp_path / "transforms.json"
     file.write_text(file.read_text()[:200])
@@ -295,7 +293,7 @@ def test_json_that_breaks_off(tmp_path):
     assert "cannot be read" in refusal(tmp_path)
 
 
-def test_training_frames_must_be_left(tmp_path):
+def test_too_few_training_frames_are_refused(tmp_path):
     cameras = ring(3)
     for split, indices in (("train", [0]), ("test", [1, 2])):
         paths = [f"{i}.png" for i in indices]
@@ -305,7 +303,7 @@ def test_training_frames_must_be_left(tmp_path):
     assert "1 of 3 images are for training" in refusal(tmp_path)
 
 
-def test_a_link_to_nothing_is_no_folder_of_plain_photographs(tmp_path):
+def test_a_dangling_link_is_refused(tmp_path):
     (tmp_path / "transforms.json").symlink_to(tmp_path / "gone.json")
     for read in (load_scene, has_poses):
         with pytest.raises(LinprimError, match="transforms.json: is a link to a file that is not there"):

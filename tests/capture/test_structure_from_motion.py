@@ -1,5 +1,4 @@
-"""Poses of photographs that come without: against cameras known exactly, kept, gone on with after a stop, and
-judged."""
+"""Structure from motion for plain photographs: accuracy, caching, resumption, and judgement of the result."""
 
 from __future__ import annotations
 
@@ -51,7 +50,7 @@ def room(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def posed(room, tmp_path_factory):
-    """(cache, lines): where the poses of `room` were found, and what was said."""
+    """(cache, lines): the cache with the poses of `room`, and the log of their search."""
     cache, lines = tmp_path_factory.mktemp("cache"), []
     prepare(str(room), cache=cache, threads=1, log=lines.append)
     return cache, lines
@@ -73,7 +72,7 @@ def aligned(found: np.ndarray, wanted: np.ndarray) -> tuple[float, np.ndarray, n
     return scale, rotation, scale * a @ rotation.T + wanted.mean(0)
 
 
-def test_poses_and_points_are_the_true_ones_but_for_a_similarity(room, posed):
+def test_poses_and_points_are_recovered_up_to_a_similarity(room, posed):
     cache, lines = posed
     scene = load_scene(room, cache=cache)
     assert scene.kind == PHOTOGRAPHS and [view.name for view in scene.test] == ["0", "8"]
@@ -96,7 +95,7 @@ def test_poses_and_points_are_the_true_ones_but_for_a_similarity(room, posed):
     assert not any(line.startswith("warning") for line in lines)
 
 
-def test_what_was_found_is_found_again_by_content(room, posed, copied, monkeypatch):
+def test_found_poses_are_cached_by_content(room, posed, copied, monkeypatch):
     cache, _ = posed
     monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: pytest.fail("made again"))
     lines: list[str] = []
@@ -109,8 +108,8 @@ def test_what_was_found_is_found_again_by_content(room, posed, copied, monkeypat
 
 
 @pytest.mark.parametrize("better", [True, False])
-def test_poses_are_refined_once(posed, copied, tmp_path, better):
-    """What is refined takes the place of the model; what could not be is not tried again."""
+def test_poses_are_refined_only_once(posed, copied, tmp_path, better):
+    """A refined model replaces the original, and a failed refinement is not repeated."""
     cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
     asked, before = [], (found_model(copied, cache) / "points3D.bin").read_bytes()
 
@@ -130,7 +129,7 @@ def test_poses_are_refined_once(posed, copied, tmp_path, better):
     assert [path.name for path in model.parent.iterdir() if path.is_dir()] == ["model"]
 
 
-def test_a_full_disk_is_told_and_the_model_there_was_stays(posed, copied, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_keeps_the_model(posed, copied, tmp_path, monkeypatch):
     cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
     before = {file: file.read_bytes() for file in found_model(copied, cache).iterdir()}
 
@@ -154,7 +153,7 @@ def test_a_full_disk_is_told_and_the_model_there_was_stays(posed, copied, tmp_pa
         find_poses(copied, tmp_path / "empty")
 
 
-def test_without_being_asked_no_poses_are_looked_for(copied, tmp_path):
+def test_load_scene_does_not_search_for_poses(copied, tmp_path):
     with pytest.raises(
         LinprimError,
         match="no camera poses found.*linprim-geo inspect and train find those of plain photographs",
@@ -164,7 +163,7 @@ def test_without_being_asked_no_poses_are_looked_for(copied, tmp_path):
 
 
 @pytest.mark.parametrize("stage", ["_match", "_map"])
-def test_a_run_that_was_stopped_goes_on(copied, tmp_path, monkeypatch, stage):
+def test_an_interrupted_search_is_resumed(copied, tmp_path, monkeypatch, stage):
     import pycolmap
 
     with monkeypatch.context() as patch:
@@ -175,7 +174,7 @@ def test_a_run_that_was_stopped_goes_on(copied, tmp_path, monkeypatch, stage):
     monkeypatch.setattr(pycolmap, "extract_features", lambda *_, **__: pytest.fail("keypoints made again"))
     if stage == "_map":
         monkeypatch.setattr(pycolmap, "match_image_pairs", lambda *_, **__: pytest.fail("matches made again"))
-    # There is room for what is not there yet.
+    # Disk space is needed only for the remaining part.
     (database,) = (tmp_path / "cache").rglob("database.db")
     room = structure_from_motion.ROOM + COUNT * structure_from_motion.ROOM_PER_PHOTOGRAPH - database.stat().st_size
     with monkeypatch.context() as patch:
@@ -184,7 +183,7 @@ def test_a_run_that_was_stopped_goes_on(copied, tmp_path, monkeypatch, stage):
     assert len(load_scene(copied, cache=tmp_path / "cache").views) == COUNT
 
 
-def test_photographs_that_do_not_overlap_are_refused_and_stay_so(tmp_path, monkeypatch):
+def test_photographs_without_overlap_are_refused_and_the_result_cached(tmp_path, monkeypatch):
     for i in range(4):
         picture(i, (120, 90)).save(tmp_path / f"{i}.png")
     with pytest.raises(
@@ -197,7 +196,7 @@ def test_photographs_that_do_not_overlap_are_refused_and_stay_so(tmp_path, monke
             again(tmp_path, cache=tmp_path / "cache")
 
 
-def test_photographs_that_show_nothing_or_break_off_are_left_out(copied, tmp_path, monkeypatch):
+def test_blank_and_truncated_photographs_are_left_out(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(image_pairs, "_MATCH_ALL", 3)
     Image.new("RGB", SIZE, (120, 120, 120)).save(copied / "blank.png")
     (copied / "3.png").rename(copied / "my  photo 3.png")
@@ -212,7 +211,7 @@ def test_photographs_that_show_nothing_or_break_off_are_left_out(copied, tmp_pat
     assert found == [*"01245678", "my  photo 3"]
 
 
-def test_too_few_photographs_and_broken_ones_are_named(copied, tmp_path):
+def test_too_few_or_invalid_photographs_are_refused(copied, tmp_path):
     (tmp_path / "two").mkdir()
     for i in range(2):
         picture(i).save(tmp_path / "two" / f"{i}.png")
@@ -225,13 +224,13 @@ def test_too_few_photographs_and_broken_ones_are_named(copied, tmp_path):
         prepare(tmp_path / "nowhere")
 
 
-def test_captures_with_poses_are_left_alone(tmp_path, monkeypatch):
+def test_captures_with_poses_are_not_searched(tmp_path, monkeypatch):
     write_transforms(tmp_path, 4)
     monkeypatch.setattr(structure_from_motion, "find_poses", lambda *_, **__: pytest.fail("has poses"))
     prepare(tmp_path)
 
 
-def test_verdicts():
+def test_verdicts_describe_doubts():
     assert (
         Verdict(4, 2).unusable and Verdict(10, 4).unusable and not Verdict(6, 3).unusable and not Verdict(3, 3).unusable
     )
@@ -245,7 +244,7 @@ def test_verdicts():
     assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
 
 
-def test_poor_poses_are_warned_of_in_one_line(copied, tmp_path, monkeypatch):
+def test_poor_poses_give_one_warning(copied, tmp_path, monkeypatch):
     monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: Verdict(9, 6, 100, 0.4, 3.5))
     lines: list[str] = []
     find_poses(copied, tmp_path / "cache", log=lines.append)
@@ -253,7 +252,7 @@ def test_poor_poses_are_warned_of_in_one_line(copied, tmp_path, monkeypatch):
     assert warning.startswith("warning: the poses are poor, and so may be the result: 3 photographs are left out, so")
 
 
-def test_which_images_are_photographs(tmp_path):
+def test_photographs_are_found_in_the_folder_or_images(tmp_path):
     for name in (
         "a.png",
         ".hidden.png",
@@ -271,7 +270,7 @@ def test_which_images_are_photographs(tmp_path):
     assert photographs(tmp_path)[1] == []
 
 
-def test_photographs_that_are_alike_share_a_camera_and_exif_gives_its_focal_length(tmp_path):
+def test_photographs_share_cameras_by_folder_size_and_exif_focal_length(tmp_path):
     import pycolmap
 
     names = ["a.jpg", "b.jpg", "long.jpg", "wide.jpg", "z/a.jpg"]
@@ -293,7 +292,7 @@ def test_photographs_that_are_alike_share_a_camera_and_exif_gives_its_focal_leng
 
 
 class _Database:
-    """Photographs in a ring, of which each shares half of its descriptors with either neighbour."""
+    """Photographs in a ring; each shares half of its descriptors with either neighbour."""
 
     def __init__(self, count: int):
         rng = np.random.default_rng(0)
@@ -313,7 +312,7 @@ class _Database:
         return type("Descriptors", (), {"data": self.descriptors[image - 1]})
 
 
-def test_of_many_photographs_those_that_look_alike_or_follow_each_other_are_matched():
+def test_many_photographs_are_matched_by_similarity_and_sequence():
     few, many = _Database(10), _Database(64)
     assert len(pairs_to_match(few, 10)) == 45
     pairs = pairs_to_match(many, 64)
@@ -321,7 +320,7 @@ def test_of_many_photographs_those_that_look_alike_or_follow_each_other_are_matc
     assert (0, 63) in pairs and (0, 5) in pairs and (0, 6) not in pairs
 
 
-def test_two_processes_do_not_find_the_same_poses_twice(copied, posed, tmp_path, monkeypatch):
+def test_a_second_process_waits_for_the_poses(copied, posed, tmp_path, monkeypatch):
     kept = found_poses._base(tmp_path / "cache") / found_poses._key(*photographs(copied))
     model = found_model(copied, posed[0])
     lines, waiting, done = [], threading.Event(), threading.Event()
@@ -341,7 +340,7 @@ def test_two_processes_do_not_find_the_same_poses_twice(copied, posed, tmp_path,
     assert done.is_set() and len(lines) == 2
 
 
-def test_a_run_keeps_the_poses_it_was_trained_with(copied, posed, tmp_path, monkeypatch):
+def test_a_run_keeps_its_poses(copied, posed, tmp_path, monkeypatch):
     shutil.copytree(posed[0], tmp_path / "cache")
     monkeypatch.setenv("LINPRIM_GEO_CACHE", str(tmp_path / "cache"))
     options = [
@@ -363,7 +362,7 @@ def test_a_run_keeps_the_poses_it_was_trained_with(copied, posed, tmp_path, monk
     np.testing.assert_array_equal(before, after)
 
 
-def test_webp_photographs_are_read_as_well(copied, posed, tmp_path):
+def test_webp_photographs_are_read(copied, posed, tmp_path):
     for number in range(COUNT):
         with Image.open(copied / f"{number}.png") as image:
             image.save(copied / f"{number}.webp", lossless=True)
@@ -387,7 +386,7 @@ def test_webp_photographs_are_read_as_well(copied, posed, tmp_path):
     ]
 
 
-def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
+def test_photographs_with_a_wrong_suffix_are_copied_as_png(tmp_path):
     names = ["0.png", "1.png"]
     for index, (name, kind) in enumerate(zip(names, ("PNG", "GIF"), strict=True)):
         picture(index).convert("L").save(tmp_path / name, format=kind)
@@ -411,7 +410,7 @@ def test_a_photograph_whose_suffix_is_wrong_is_copied_as_png(tmp_path):
         b'{"photographs": 9, "registered": 9, "misplaced": [1]}',
     ],
 )
-def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged):
+def test_damaged_results_are_not_used(copied, posed, tmp_path, damaged):
     kept = shutil.copytree(found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k").parent
     kept = (kept / "k").rename(kept / found_model(copied, posed[0]).parent.name)
     assert found_model(copied, tmp_path) == kept / "model"
@@ -419,7 +418,7 @@ def test_a_result_that_is_damaged_is_not_taken(copied, posed, tmp_path, damaged)
     assert found_model(copied, tmp_path) is None
 
 
-def test_a_result_without_its_model_is_not_taken(copied, posed, tmp_path):
+def test_results_without_a_model_are_not_used(copied, posed, tmp_path):
     cache = Path(shutil.copytree(posed[0], tmp_path / "cache"))
     shutil.rmtree(found_model(copied, cache))
     assert found_model(copied, cache) is None
@@ -454,7 +453,7 @@ def test_pycolmap_is_imported_in_one_place():
     assert found == ["load_pycolmap.py"]
 
 
-def test_wrong_matches_do_not_decide_about_the_focal_length():
+def test_the_focal_length_is_robust_against_wrong_matches():
     import pycolmap
 
     pycolmap.set_random_seed(0)

@@ -1,5 +1,4 @@
-"""Frames of a video: the sharpest of each part, kept under the video's content, and one sentence for what cannot be
-decoded."""
+"""Frames of a video: the sharpest of each part, caching by content, and errors for invalid videos."""
 
 from __future__ import annotations
 
@@ -41,7 +40,7 @@ def write_video(path, images, rate=10, matrix=None):
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    """24 frames, all blurred but for the numbers 1, 6, 13 and 23: one in each quarter."""
+    """24 frames, of which only 1, 6, 13 and 23, one in each quarter, are sharp."""
     path = tmp_path_factory.mktemp("video") / "walk.mp4"
     images = [picture(i, (64, 48)).resize((96, 64)) for i in range(24)]
     images = [
@@ -88,7 +87,7 @@ ONE = 1 << 16
         (0, -ONE, -ONE, 0, Image.Transpose.TRANSVERSE),
     ],
 )
-def test_frames_are_turned_as_the_video_says(a, b, c, d, shown, tmp_path):
+def test_frames_are_rotated_by_the_display_matrix(a, b, c, d, shown, tmp_path):
     image = Image.new("RGB", (96, 64), (20, 20, 20))
     image.paste((230, 30, 30), (0, 0, 48, 16))
     image.paste((30, 230, 30), (80, 32, 96, 64))
@@ -99,7 +98,7 @@ def test_frames_are_turned_as_the_video_says(a, b, c, d, shown, tmp_path):
     assert np.abs(np.asarray(found, np.float32) - np.asarray(wanted, np.float32)).mean() < 6
 
 
-def test_frames_are_kept_by_content_and_number(video, tmp_path, monkeypatch):
+def test_frames_are_cached_by_content_and_number(video, tmp_path, monkeypatch):
     folder = extract_frames(video, 4, tmp_path)
     moved = shutil.copy(video, tmp_path / "other.mp4")
     monkeypatch.setattr(video_frames, "_pyav", lambda: pytest.fail("decoded again"))
@@ -110,7 +109,7 @@ def test_frames_are_kept_by_content_and_number(video, tmp_path, monkeypatch):
     assert video_frames.frames_folder(video, 5, tmp_path) != folder
 
 
-def test_videos_that_cannot_be_decoded_are_named(video, tmp_path, monkeypatch):
+def test_invalid_videos_are_refused(video, tmp_path, monkeypatch):
     for name, content in (
         ("empty.mp4", b""),
         ("text.mov", b"no video"),
@@ -143,7 +142,7 @@ def test_a_video_is_a_capture_once_its_poses_are_found(tmp_path):
     assert abs(scene.train[0].camera.fx / 165 - 1) < 0.1
 
 
-def test_two_processes_do_not_take_the_same_frames_twice(tmp_path, video, monkeypatch):
+def test_a_second_process_waits_for_the_frames(tmp_path, video, monkeypatch):
     folder = video_frames.frames_folder(video, 4, tmp_path)
     lines, waiting = [], threading.Event()
 
@@ -161,7 +160,7 @@ def test_two_processes_do_not_take_the_same_frames_twice(tmp_path, video, monkey
     assert not other.is_alive() and len(lines) == 1
 
 
-def test_a_disk_that_is_full_is_not_called_a_broken_video(tmp_path, video, monkeypatch):
+def test_a_full_disk_is_not_reported_as_an_invalid_video(tmp_path, video, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
