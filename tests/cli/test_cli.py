@@ -1,4 +1,4 @@
-"""The command line: options, exit statuses, what goes to which stream, and that help imports no library."""
+"""The command line: options, exit statuses, output streams, and fast help."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def run_python(code: str, *flags: str, **settings) -> subprocess.CompletedProces
 
 
 def run_with_convert(body: str, *arguments: str) -> str:
-    """Source of a program that runs `linprim-geo convert a b` with `body` in the place of the conversion."""
+    """Source of a program that runs `linprim-geo convert a b` with `body` as conversion."""
     return (
         "import os, sys, time\nimport linprim_geo.surface.convert as module\nfrom linprim_geo.cli.main import main\n"
         "module.describe = str\n"
@@ -76,7 +76,7 @@ def failing_convert(monkeypatch):
 
 @pytest.fixture
 def recorded_train(monkeypatch):
-    """Stands in for the training itself and keeps what it was called with."""
+    """Replace the training by a function that records its arguments."""
     calls = []
 
     def train(scene, run, scene_options, train_options, **settings):
@@ -97,7 +97,7 @@ def test_help_imports_no_library(arguments):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_explains_itself(command, capsys):
+def test_every_command_has_help(command, capsys):
     with pytest.raises(SystemExit) as leaving:
         cli.main([command, "--help"])
     assert leaving.value.code == 0
@@ -113,7 +113,7 @@ def test_every_field_of_the_training_options_is_an_option(capsys):
         assert f"--{field.name.replace('_', '-')} " in text
 
 
-def test_options_become_the_dataclass_they_come_from():
+def test_options_round_trip_to_their_dataclass():
     @dataclasses.dataclass(frozen=True)
     class Options:
         step_size: float = option(0.5, "share, up to 100%")
@@ -133,7 +133,7 @@ def test_options_become_the_dataclass_they_come_from():
         assert leaving.value.code == 2
 
 
-def test_train_gets_what_was_said(recorded_train, capsys):
+def test_train_receives_the_given_options(recorded_train, capsys):
     assert cli.main("train data/lego -o out --iterations 12 --downscale 4 --resume --quiet".split()) == 0
     assert cli.main(["train", "data/lego/"]) == 0
     (scene, run, scene_options, train_options, settings), (_, default_run, *_, by_default) = recorded_train
@@ -148,7 +148,7 @@ def test_train_gets_what_was_said(recorded_train, capsys):
     assert "primitives: 7" in capsys.readouterr().out
 
 
-def test_blocks_and_where_they_are_trained_are_passed_on(recorded_train):
+def test_options_of_blocks_are_passed_on(recorded_train):
     assert cli.main("train data/lego --blocks auto".split()) == 0
     assert cli.main("train data/lego --blocks 4 --cluster local --workers 3".split()) == 0
     said = [tuple(call[4][name] for name in ("blocks", "cluster", "workers")) for call in recorded_train]
@@ -177,13 +177,13 @@ def test_options_of_3dgs_are_understood(recorded_train, tiny_scene):
         ("-r 300", "data/lego"),
     ],
 )
-def test_a_resolution_that_makes_no_sense_is_refused(arguments, sentence, recorded_train, capsys):
+def test_invalid_resolutions_are_refused(arguments, sentence, recorded_train, capsys):
     assert cli.main(["train", "-s", "data/lego", *arguments.split()]) == 1
     error = capsys.readouterr().err
     assert sentence in error and error.count("\n") == 1 and not recorded_train
 
 
-def test_kinds_and_rules_are_options(recorded_train):
+def test_kinds_and_rules_are_parsed(recorded_train):
     line = "train a --primitive tetrahedron --ray-model affine --order overlap --filter 3d+screen --population mcmc"
     assert cli.main(line.split()) == 0
     options = recorded_train[0][3]
@@ -192,7 +192,7 @@ def test_kinds_and_rules_are_options(recorded_train):
 
 
 @pytest.mark.parametrize("arguments", ["train", "train a -s b"])
-def test_train_wants_exactly_one_scene(arguments, capsys):
+def test_train_requires_exactly_one_scene(arguments, capsys):
     assert cli.main(arguments.split()) == 1
     assert "one scene" in capsys.readouterr().err
 
@@ -217,7 +217,7 @@ def test_train_wants_exactly_one_scene(arguments, capsys):
         (ZeroDivisionError("division\nby zero"), 70, "internal error: ZeroDivisionError: division by zero"),
     ],
 )
-def test_an_error_is_one_sentence(error, status, sentence, failing_convert, capsys):
+def test_errors_are_printed_in_one_line(error, status, sentence, failing_convert, capsys):
     failing_convert(error)
     assert cli.main(["convert", "a", "b"]) == status
     captured = capsys.readouterr()
@@ -230,7 +230,7 @@ def test_an_error_is_one_sentence(error, status, sentence, failing_convert, caps
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_json_is_all_there_is_on_stdout():
+def test_json_is_the_only_output_on_stdout():
     noise = "os.write(1, b'from C'); print('from Python')"
     result = "return {'x': float('nan'), 'y': [1, 2.5]}"
     done = run_python(run_with_convert(f"{noise}; {result}", "--json"))
@@ -244,13 +244,13 @@ def test_json_prints_nothing_on_stdout_after_an_error():
     assert (done.returncode, done.stdout) == (70, "")
 
 
-def test_json_may_stand_before_the_command(recorded_train, capsys):
+def test_json_may_precede_the_command(recorded_train, capsys):
     assert cli.main(["--json", "train", "a"]) == 0
     assert json.loads(capsys.readouterr().out) == {"psnr": None, "primitives": 7}
     assert len(recorded_train) == 1
 
 
-def test_a_reader_that_goes_away_is_no_traceback():
+def test_a_closed_pipe_gives_no_traceback():
     reading, writing = os.pipe()
     os.close(reading)
     try:
@@ -263,7 +263,7 @@ def test_a_reader_that_goes_away_is_no_traceback():
     assert (done.returncode, done.stderr) == (141, "")
 
 
-def test_ctrl_c_is_one_sentence():
+def test_ctrl_c_prints_one_line():
     code = run_with_convert("print('ready', flush=True); time.sleep(30)")
     process = subprocess.Popen(
         [sys.executable, "-c", code],
@@ -286,7 +286,7 @@ def test_python_m_runs_the_same_program():
 
 
 @pytest.mark.parametrize("words", [["linprim-geo"], ["python", "-m", "linprim_geo"]])
-def test_commands_import_nothing_from_the_folder_they_are_called_in(words, tmp_path):
+def test_commands_import_nothing_from_the_working_directory(words, tmp_path):
     plant_modules(tmp_path)
     words = [str(Path(sys.executable).with_name(words[0])), *words[1:]]
     done = subprocess.run([*words, "inspect", "."], cwd=tmp_path, capture_output=True, text=True, timeout=60)
@@ -294,7 +294,7 @@ def test_commands_import_nothing_from_the_folder_they_are_called_in(words, tmp_p
     assert not (tmp_path / "imported").exists()
 
 
-def test_synth_leaves_what_is_not_said_to_the_library(monkeypatch, capsys):
+def test_synth_passes_on_only_given_options(monkeypatch, capsys):
     calls = []
     stand_in = types.SimpleNamespace(
         synthesize=lambda out, options, **surface: calls.append((out, options, surface)) or {}
@@ -332,7 +332,7 @@ PASSED_ON = {
 
 
 @pytest.mark.parametrize("line", PASSED_ON)
-def test_the_functions_have_the_arguments_that_the_commands_pass(line):
+def test_functions_accept_the_arguments_of_commands(line):
     path, renamed = PASSED_ON[line]
     module, _, name = path.rpartition(".")
     function = getattr(importlib.import_module(f"linprim_geo.{module}"), name)
@@ -393,7 +393,7 @@ def command_help(command: str) -> str:
         "demo -o .",
     ],
 )
-def test_input_that_cannot_be_used_is_one_sentence_and_leaves_nothing(line, tmp_path, monkeypatch, capfd):
+def test_invalid_input_is_refused_and_leaves_no_files(line, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "here").write_text("mine")
     assert cli.main([*line.split(), "--json"]) == 1
@@ -415,7 +415,7 @@ WITH_THREADS = {
 
 
 @pytest.mark.parametrize(("line", "function"), WITH_THREADS.items())
-def test_threads_limit_what_a_command_takes(line, function, monkeypatch):
+def test_threads_limits_the_cores_of_a_command(line, function, monkeypatch):
     from linprim_geo.base.cores import usable_cores
     from linprim_geo.kernels import ops
 
@@ -436,7 +436,7 @@ THREADS_OF_OPTIONS = {"train", "inspect", "stereo", "tradeoff", "synth"}
 NO_THREADS = {"convert", "doctor", "completion"}
 
 
-def test_every_command_that_computes_takes_threads():
+def test_every_computing_command_has_threads():
     (commands,) = (
         action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction)
     )
@@ -449,7 +449,7 @@ def test_every_command_that_computes_takes_threads():
 
 
 @pytest.mark.parametrize("line", ["RUN p.npz", "RUN p.ply", "RUN p.glb", "SCENE/reference.ply m.obj", "BALL m.ply"])
-def test_converting_computes_nothing_in_the_core(line, tiny_run, tiny_scene, tmp_path, monkeypatch):
+def test_convert_does_not_use_the_core(line, tiny_run, tiny_scene, tmp_path, monkeypatch):
     from helpers.surfaces import sphere
 
     from linprim_geo.geometry.mesh_files import save_mesh

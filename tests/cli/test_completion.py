@@ -1,5 +1,4 @@
-"""Completion: what bash offers for the beginning of a line, and that the other shells' scripts hold every command and
-option."""
+"""Shell completion: candidates of bash, and scripts of other shells with all commands and options."""
 
 from __future__ import annotations
 
@@ -63,7 +62,7 @@ def test_bash_completes_commands_options_choices_and_files(line, offered, bash_s
 
 
 @pytest.mark.parametrize(("shell", "first"), [("zsh", "#compdef linprim-geo"), ("fish", "complete -c linprim-geo")])
-def test_the_other_shells_know_every_command_and_option(shell, first, capsys):
+def test_scripts_of_other_shells_contain_every_command_and_option(shell, first, capsys):
     assert cli.main(["completion", shell]) == 0
     script = capsys.readouterr().out
     assert first in script
@@ -74,7 +73,7 @@ def test_the_other_shells_know_every_command_and_option(shell, first, capsys):
                 assert option.lstrip("-") in script, option
 
 
-def test_without_shtab_it_says_what_to_install(monkeypatch, capsys):
+def test_missing_shtab_is_reported(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "shtab", None)
     assert cli.main(["completion", "zsh"]) == 1
     shown = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""The demo, made tiny: it scores, a second one replaces the first, and it touches nobody else's folder."""
+"""The demo at a tiny size: scores, replacement of an earlier demo, and protection of other folders."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tiny_size(monkeypatch):
     monkeypatch.setitem(demo.SIZES, "small", (10, 40, 120, 120))
 
 
-def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tmp_path, capsys, monkeypatch):
+def test_the_demo_scores_a_mesh_and_replaces_an_earlier_demo(tiny_size, tmp_path, capsys, monkeypatch):
     root = tmp_path / "demo"
     first = demo.run_demo(str(root), "small")
     shown = capsys.readouterr()
@@ -75,7 +75,7 @@ def test_the_demo_makes_a_scored_mesh_and_a_second_one_replaces_it(tiny_size, tm
     assert json.loads((root / "demo.json").read_text()).keys() == {"size"}
 
 
-def test_a_folder_of_somebody_else_is_refused(tiny_size, tmp_path):
+def test_folders_not_made_by_the_demo_are_refused(tiny_size, tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(LinprimError, match="not made by the demo.*-o"):
         demo.run_demo(str(tmp_path), "small")

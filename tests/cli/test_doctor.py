@@ -27,7 +27,7 @@ def test_doctor_shows_the_cache(monkeypatch, tmp_path, capsys):
     assert any("LINPRIM_GEO_CACHE" in problem for problem in problems)
 
 
-def test_doctor_names_what_is_missing(monkeypatch, capsys):
+def test_doctor_names_missing_libraries(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)), ("no_such_module", ("no-such-package",))))
     assert cli.main(["doctor", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
@@ -38,7 +38,7 @@ def test_doctor_names_what_is_missing(monkeypatch, capsys):
     assert "no_such_module MISSING" in capsys.readouterr().out
 
 
-def test_doctor_says_what_is_short(monkeypatch, capsys, tmp_path):
+def test_doctor_reports_low_memory_and_disk_space(monkeypatch, capsys, tmp_path):
     monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
     monkeypatch.setattr(doctor, "_memory", lambda: (8 * 2**30, 3 * 2**30, 8 * 2**30))
     usage = types.SimpleNamespace(free=3 * 2**29)
@@ -53,7 +53,7 @@ def test_doctor_says_what_is_short(monkeypatch, capsys, tmp_path):
     assert "are free on the disk" not in capsys.readouterr().out
 
 
-def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypatch):
+def test_missing_system_libraries_come_with_an_install_command(monkeypatch):
     absent = system.SystemLibrary("libnosuch.so.9", "libnosuch9", "nosuch", "nothing")
     monkeypatch.setattr(system, "LINUX_LIBRARIES", (absent,))
     monkeypatch.setattr(sys, "platform", "linux")
@@ -66,12 +66,12 @@ def test_missing_system_libraries_come_with_the_line_that_installs_them(monkeypa
     assert system.install_command([absent]) is None
 
 
-def test_a_compiler_that_cannot_do_cxx20_is_named(monkeypatch):
+def test_a_compiler_without_cxx20_is_named(monkeypatch):
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert "no-such-compiler does not compile C++20" in system.compiler_problem()
 
 
-def test_doctor_tells_limits_from_the_machine(monkeypatch, capsys):
+def test_doctor_reports_limits_of_containers(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "LIBRARIES", (("numpy", ("numpy",)),))
     monkeypatch.setattr(doctor, "container", lambda: "podman")
     monkeypatch.setattr(doctor, "usable_cores", lambda: 2)

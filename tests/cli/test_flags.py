@@ -1,4 +1,4 @@
-"""Flags of options: what is typed becomes a value that its own check takes."""
+"""Flags of options: parsed values have the right type and pass the checks."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def numbers(options: type):
 
 
 @pytest.mark.parametrize("options", CLASSES, ids=lambda cls: cls.__name__)
-def test_a_number_that_is_typed_is_taken(options):
+def test_flags_of_numbers_are_parsed_to_their_type(options):
     for field, value in numbers(options):
         parser = argparse.ArgumentParser()
         add_options(parser, options)

@@ -1,4 +1,4 @@
-"""Fuzzing of every reader: damaged inputs end in a sentence or are read, and what is wrong is told."""
+"""Fuzzing of all readers: damaged inputs are read or refused, and failures are reported."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import fuzz_inputs  # noqa: E402
 import fuzz_readers  # noqa: E402
 
 
-def test_some_hundred_damaged_inputs_of_every_reader():
+def test_readers_read_or_refuse_damaged_inputs():
     """The same command with --inputs 100000 takes some ten minutes."""
     inputs = 60 * len(fuzz_readers.READERS)
     command = ["--inputs", str(inputs), "--seed", "7"]
@@ -52,7 +52,7 @@ def attempt(tmp_path, read) -> str:
     return outcome
 
 
-def test_fuzzing_tells_what_is_wrong(tmp_path, monkeypatch):
+def test_fuzzing_classifies_failures(tmp_path, monkeypatch):
     import signal
 
     def fail(error):
@@ -74,14 +74,14 @@ def test_fuzzing_tells_what_is_wrong(tmp_path, monkeypatch):
         signal.signal(signal.SIGALRM, before)
 
 
-def test_an_input_follows_from_seed_reader_and_number(tmp_path):
+def test_inputs_are_reproducible(tmp_path):
     case = a_reader(tmp_path, lambda: None)
     inputs = [[case.damage(seed, number).read_bytes() for number in range(50)] for seed in (0, 0, 1)]
     assert inputs[0] == inputs[1] != inputs[2] and len(set(inputs[0])) > 30
 
 
 @pytest.mark.parametrize("kind", ["ply", "text", "json", "zip", "npy", "png", "glb", "binary"])
-def test_mutations_take_whatever_they_are_given(kind):
+def test_mutations_accept_any_data(kind):
     rng = np.random.default_rng(0)
     packed = io.BytesIO()
     np.savez(packed, a=np.zeros(3), b=np.array("x"))

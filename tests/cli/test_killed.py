@@ -1,5 +1,5 @@
-"""Killed at random moments and in the middle of their writes, training, extraction and conversion lose nothing; two
-processes never write into one folder."""
+"""Training, extraction and conversion killed at random moments lose nothing; two processes never write into one
+folder."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(scene, jobs, tmp_path_factory):
-    """(an uninterrupted run, what its job answered)."""
+    """(an uninterrupted run, the result of its job)."""
     run = tmp_path_factory.mktemp("whole") / "run"
     done = jobs.run("train", scene, run, json.dumps(OPTIONS), False)
     assert not done["killed"] and not done["error"]
@@ -97,7 +97,7 @@ def leftovers(folder: Path) -> list[Path]:
 
 
 def assert_usable(run: Path) -> int:
-    """Whatever is there loads; returns the step of the checkpoint, -1 without one."""
+    """Check that existing files load; return the step of the checkpoint, -1 without one."""
     if not (run / "config.json").exists():
         assert not any((run / name).exists() for name in (*SAVED, "run.json", "checkpoints"))
         return -1
@@ -116,7 +116,7 @@ def assert_usable(run: Path) -> int:
     return -1 if state is None else state["step"]
 
 
-def test_training_killed_goes_on_to_the_same_bits(jobs, scene, whole, tmp_path):
+def test_killed_trainings_resume_bit_for_bit(jobs, scene, whole, tmp_path):
     reference, done = whole
     seconds, writes = done["seconds"], len(done["writes"])
     rng, kills, reached, runs = random.Random(), 0, [], 0
@@ -143,7 +143,7 @@ def test_training_killed_goes_on_to_the_same_bits(jobs, scene, whole, tmp_path):
     assert len(set(reached)) > 5, "all kills hit the same moment"
 
 
-def test_a_run_killed_before_it_began_is_begun_anew(jobs, scene, whole, tmp_path):
+def test_a_run_killed_before_its_start_is_started_again(jobs, scene, whole, tmp_path):
     for name, resume in (("resumed", True), ("anew", False)):
         run = tmp_path / name
         run.mkdir()
@@ -155,7 +155,7 @@ def test_a_run_killed_before_it_began_is_begun_anew(jobs, scene, whole, tmp_path
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb"])
-def test_extraction_killed_leaves_whole_meshes(suffix, jobs, whole, tmp_path):
+def test_killed_extractions_leave_complete_meshes(suffix, jobs, whole, tmp_path):
     job = ("extract", shutil.copytree(whole[0], tmp_path / "run"))
     reference, target = tmp_path / f"reference{suffix}", tmp_path / "out" / f"mesh{suffix}"
     done = jobs.run(*job, reference)
@@ -177,7 +177,7 @@ def test_extraction_killed_leaves_whole_meshes(suffix, jobs, whole, tmp_path):
     assert not leftovers(tmp_path / "out") and not leftovers(tmp_path / "run")
 
 
-def test_conversion_killed_leaves_the_old_file_or_the_new(jobs, tmp_path):
+def test_killed_conversions_leave_the_old_or_the_new_file(jobs, tmp_path):
     # So many that writing is what takes the time.
     rng, source, count = np.random.default_rng(0), tmp_path / "source.npz", 20_000
     arrays = (
@@ -217,7 +217,7 @@ with locked(Path(sys.argv[1]), "held"):
 
 @pytest.fixture
 def holder():
-    """Holds a folder in another process; returns that process."""
+    """Lock a folder in another process; return that process."""
     started = []
 
     def hold(folder: Path) -> subprocess.Popen:
@@ -283,13 +283,13 @@ def test_a_second_extraction_into_a_folder_is_refused(whole, holder, tmp_path):
         pass
 
 
-def test_what_is_held_and_comes_to_nothing_leaves_nothing(tmp_path):
+def test_failed_trainings_leave_no_lock(tmp_path):
     with pytest.raises(LinprimError, match="no such"):
         train(tmp_path / "no_scene", tmp_path / "runs" / "a", quiet=True)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_different_files_of_a_folder_do_not_hinder_each_other(tmp_path):
+def test_locks_of_different_files_are_independent(tmp_path):
     with locked(tmp_path, "written", "a.ply"), locked(tmp_path, "written", "b.ply"):
         with pytest.raises(LinprimError, match="a.ply: is being written"), locked(tmp_path, "written", "a.ply"):
             pass

@@ -1,4 +1,4 @@
-"""What commands print: one object with --json, nothing else with --quiet, and that they do what they say."""
+"""Output of commands: one object with --json, nothing else with --quiet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from linprim_geo.cli import main as cli
 
 @pytest.fixture
 def result(capfd):
-    """Runs a command with --json and returns what it printed, after making sure that it is one object."""
+    """Run a command with --json, check that it prints one object, and return it."""
 
     def run(line: str, status: int = 0) -> dict:
         capfd.readouterr()
@@ -32,7 +32,7 @@ def result(capfd):
     return run
 
 
-def test_every_command_prints_one_object_and_does_what_it_says(result, tmp_path, monkeypatch):
+def test_every_command_prints_one_json_object(result, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = result("synth s --scene cad --size 48x40 --views 10 --test-views 2 --points 300 --supersample 1")
     assert (made["views"], made["test_views"], made["width"], made["height"]) == (10, 2, 48, 40)
@@ -91,7 +91,7 @@ REPORTING = {
 
 @pytest.fixture
 def talkative(monkeypatch):
-    """Lines of progress are far apart in a log; here every one of them is due."""
+    """Print every line of progress, not only one in a while."""
     monkeypatch.setattr(
         progress,
         "time",
@@ -111,12 +111,12 @@ def test_quiet_prints_one_object_and_nothing_else(
     assert shown.err == "" and shown.out.count("\n") == 1 and key in json.loads(shown.out)
 
 
-def test_what_is_not_quiet_says_something(tiny_run, tmp_path, talkative, capfd):
+def test_progress_is_printed_without_quiet(tiny_run, tmp_path, talkative, capfd):
     assert cli.main(["render", str(tiny_run), "-o", str(tmp_path / "r")]) == 0
     assert "render" in capfd.readouterr().err
 
 
-def test_quiet_is_an_option_where_something_is_reported():
+def test_commands_with_progress_have_quiet():
     takes = {"train", "inspect", "render", "extract-mesh", "stereo", "synth", "tradeoff", "demo"}
     assert {line.split()[0] for line in REPORTING} == takes - {"demo"}
     (commands,) = (

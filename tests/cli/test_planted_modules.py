@@ -1,5 +1,5 @@
-"""No command imports a module from the folder that it is called in, which may be a downloaded capture; nor do the
-processes that it starts."""
+"""Commands and their child processes import no module from the working directory, which may be a downloaded
+capture."""
 
 from __future__ import annotations
 
@@ -56,12 +56,12 @@ def capture(tiny_scene, tiny_run, tmp_path_factory) -> Path:
 
 
 def called(words: list[str], folder: Path) -> subprocess.CompletedProcess:
-    """The program, called in a folder."""
+    """Run the program in a folder."""
     return subprocess.run([str(PROGRAM), *words], cwd=folder, capture_output=True, text=True, timeout=300)
 
 
-def test_planted_modules_are_imported_where_nothing_prevents_it(tmp_path):
-    """What the other tests rely on."""
+def test_planted_modules_are_imported_without_protection(tmp_path):
+    """Check the assumption of the other tests."""
     assert {"numpy", "torch", "json", "sitecustomize"} <= set(NAMES)
     for name in NAMES:
         plant_modules(tmp_path / name)
@@ -74,7 +74,7 @@ def test_planted_modules_are_imported_where_nothing_prevents_it(tmp_path):
     assert "sitecustomize" in (tmp_path / "numpy" / "imported").read_text()
 
 
-def test_every_command_is_tried():
+def test_every_command_is_covered():
     (commands,) = (
         action.choices for action in cli.build_parser()._actions if isinstance(action, cli.argparse._SubParsersAction)
     )
@@ -95,7 +95,7 @@ def test_the_help_of_a_command_imports_nothing_planted(command, tmp_path):
         *(pytest.param(line, id=name, marks=pytest.mark.slow) for name, line in SLOW.items()),
     ],
 )
-def test_a_command_at_work_imports_nothing_planted(line, capture):
+def test_running_a_command_imports_nothing_planted(line, capture):
     (capture / "imported").unlink(missing_ok=True)
     done = called(line.split(), capture)
     found = (capture / "imported").read_text() if (capture / "imported").exists() else ""

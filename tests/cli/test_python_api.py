@@ -1,5 +1,4 @@
-"""The package as a library: names that are imported when they are used, and every Python example of the pages as it
-stands there."""
+"""The package as a library: lazily imported names, and the Python examples of the documentation."""
 
 from __future__ import annotations
 
@@ -24,15 +23,14 @@ DOCUMENTS = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "tests"
 
 
 def examples(page: Path) -> list[str]:
-    """The Python blocks of a page, each with as many empty lines before it as the page has, so that errors name the
-    page's lines."""
+    """The Python blocks of a page, each preceded by empty lines, so that errors have the line numbers of the page."""
     text = page.read_text(encoding="utf-8")
     found = [(m.start(1), m.group(1)) for m in re.finditer(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)]
     return ["\n" * text[:start].count("\n") + code for start, code in found]
 
 
 def run_examples(page: Path) -> tuple[dict, str]:
-    """What the names stand for after the blocks have run one after the other, and what they printed."""
+    """Variables after all blocks have run in order, and the printed text."""
     names: dict = {"__name__": "__main__"}
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
@@ -63,13 +61,13 @@ def test_the_examples_of_the_page_run(tmp_path, monkeypatch):
 
 
 def anchors(page: Path) -> set[str]:
-    """What links may point to in a page: its headings as GitHub writes them."""
+    """Anchors of a page: its headings as GitHub writes them."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_lead_to_files_and_headings_that_are_there(page):
+def test_links_lead_to_existing_files_and_headings(page):
     text = page.read_text(encoding="utf-8")
     links = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r"^\[[^\]]+\]: (\S+)$", text, re.MULTILINE)
     for link in links:
@@ -82,7 +80,7 @@ def test_links_lead_to_files_and_headings_that_are_there(page):
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_files_and_modules_that_pages_name_are_there(page):
+def test_files_and_modules_named_in_pages_exist(page):
     text = page.read_text(encoding="utf-8")
     named = re.findall(r"(?<![\w./])(?:linprim_geo|eval|csrc|tools|tests|docs)/[\w./]*\w", text)
     named += [
@@ -94,7 +92,7 @@ def test_files_and_modules_that_pages_name_are_there(page):
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
-def test_commands_that_pages_show_are_accepted(page):
+def test_commands_shown_in_pages_are_valid(page):
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
     shown = "".join(block for language, block in blocks if not language)
@@ -104,7 +102,7 @@ def test_commands_that_pages_show_are_accepted(page):
             cli.build_parser().parse_args(words)
 
 
-def test_every_package_is_listed_in_the_order_of_packages():
+def test_documented_packages_agree_with_pyproject():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     wanted = [name for layer in layers for name in layer.split(" | ")]
@@ -112,7 +110,7 @@ def test_every_package_is_listed_in_the_order_of_packages():
     assert sorted(re.findall(r"^\| \d* ?\| `(\w+)`", text, re.MULTILINE)) == sorted(wanted)
 
 
-def test_figures_of_the_readme_are_those_of_the_results():
+def test_figures_of_the_readme_are_in_the_results():
     rows = re.findall(r"^\| .* (?:dB|%) \| .*$", README.read_text(encoding="utf-8"), re.MULTILINE)
     measured = re.findall(r"\d[\d.]*", (ROOT / "docs" / "results.md").read_text(encoding="utf-8"))
     assert len(rows) == 5
@@ -142,13 +140,13 @@ def test_importing_the_package_imports_no_library():
     assert (done.returncode, done.stdout) == (0, "False True\n"), done.stderr
 
 
-def test_every_public_name_is_there_and_no_other():
+def test_public_names_exist_and_agree_with_type_stubs():
     for name in lg._PUBLIC:
         assert callable(getattr(lg, name)) and name in dir(lg)
     assert list(inspect.signature(lg.train).parameters)[:2] == ["scene", "run"]
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         lg.nothing  # noqa: B018
-    # What type checkers see is what there is.
+    # Names for type checkers agree with the public ones.
     source = (ROOT / "linprim_geo" / "__init__.py").read_text()
     seen = re.findall(r"^    from linprim_geo\.([\w.]+) import (\w+) as (\w+)$", source, re.MULTILINE)
     assert {name: (module, inner) for module, inner, name in seen} == lg._PUBLIC

@@ -1,4 +1,4 @@
-"""Arguments and inputs that cannot be used: one sentence that says what is wrong, and what may have been meant."""
+"""Invalid arguments and inputs: one-line errors with suggestions."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_workers_for_one_block_are_refused(command, given, tmp_path, monkeypatch
 
 @pytest.mark.skipif(sys.platform == "win32", reason="makes a symbolic link")
 @pytest.mark.parametrize("command", ["train", "inspect", "tradeoff", "render"])
-def test_a_link_to_itself_is_refused_in_one_sentence(command, tmp_path, monkeypatch, capsys):
+def test_a_circular_link_is_refused(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert cli.main([command, "loop"]) == cli.EXIT_UNUSABLE
@@ -60,7 +60,7 @@ def test_a_link_to_itself_is_refused_in_one_sentence(command, tmp_path, monkeypa
     assert [path.name for path in tmp_path.iterdir()] == ["loop"]
 
 
-def test_faces_that_are_not_finite_are_named_and_the_rest_is_scored(tmp_path, capsys):
+def test_non_finite_faces_are_reported_and_the_rest_is_scored(tmp_path, capsys):
     square = "\n0 0 0\n1 0 0\n1 1 0\n{} 1 0\n3 0 1 2\n3 0 2 3\n"
     head = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element face 2\nproperty list uchar int vertex_indices\nend_header"
@@ -87,7 +87,7 @@ def test_faces_that_are_not_finite_are_named_and_the_rest_is_scored(tmp_path, ca
         ("train scene -o run --zzzz", "unrecognized arguments: --zzzz; linprim-geo train --help explains"),
     ],
 )
-def test_a_wrong_argument_gets_one_sentence_that_says_what_may_have_been_meant(line, said, capsys):
+def test_wrong_arguments_get_one_line_with_a_suggestion(line, said, capsys):
     with pytest.raises(SystemExit) as leaving:
         cli.main(line.split())
     out, error = capsys.readouterr()
@@ -95,6 +95,6 @@ def test_a_wrong_argument_gets_one_sentence_that_says_what_may_have_been_meant(l
     assert error.count("\n") == 1 and error.startswith("linprim-geo: error: ") and said in error
 
 
-def test_a_folder_that_is_no_run_says_what_makes_one(tmp_path, capsys):
+def test_a_folder_without_a_run_is_refused_with_a_hint(tmp_path, capsys):
     assert cli.main(["extract-mesh", str(tmp_path)]) == 1
     assert "config.json is missing" in (error := capsys.readouterr().err) and "linprim-geo train" in error
