@@ -1,4 +1,4 @@
-"""Writing files: what was there stays until what is new is complete, and nothing half-written is left."""
+"""Atomic writes: the old file stays until the new one is complete, and no partial file is left."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def assert_untouched(old):
     assert [entry.name for entry in old.parent.iterdir()] == ["mesh.ply"]
 
 
-def test_the_new_file_replaces_the_old_one(old):
+def test_atomic_write_replaces_the_file_only_at_the_end(old):
     with atomic_write(old) as temporary:
         assert temporary.suffix == ".ply" and temporary.parent == old.parent and temporary != old
         temporary.write_text("new")
@@ -36,14 +36,14 @@ def test_the_new_file_replaces_the_old_one(old):
     assert [entry.name for entry in old.parent.iterdir()] == ["mesh.ply"]
 
 
-def test_folders_are_made(tmp_path):
+def test_missing_folders_are_created(tmp_path):
     with atomic_write(tmp_path / "a" / "b" / "c.json") as temporary:
         temporary.write_text("new")
     assert (tmp_path / "a" / "b" / "c.json").read_text() == "new"
 
 
 def test_permissions_follow_the_umask(tmp_path):
-    # In a process of its own: the mask is read once, when the module is imported.
+    # Runs in a separate process because the mask is read once, at import.
     code = "import os, sys; os.umask(0o027); from linprim_geo.base.files import write_json; write_json(sys.argv[1], {})"
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "x.json")], check=True)
     assert stat.S_IMODE((tmp_path / "x.json").stat().st_mode) == 0o640
@@ -64,7 +64,7 @@ def test_an_error_without_an_old_file_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_while_writing_is_one_sentence(old):
+def test_full_disk_while_writing_is_reported(old):
     with (
         pytest.raises(LinprimError, match=r"mesh\.ply.*(disk is full|no space)"),
         atomic_write(old) as temporary,
@@ -75,7 +75,7 @@ def test_a_full_disk_while_writing_is_one_sentence(old):
 
 
 @pytest.mark.parametrize("function", ["fsync", "replace"])
-def test_a_disk_that_fills_up_at_the_end_is_one_sentence(old, function, monkeypatch):
+def test_full_disk_at_fsync_or_rename_is_reported(old, function, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -90,15 +90,15 @@ def test_a_disk_that_fills_up_at_the_end_is_one_sentence(old, function, monkeypa
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full here")
-def test_a_truly_full_device_is_one_sentence(old):
+def test_full_device_is_reported(old):
     with pytest.raises(LinprimError, match=r"(disk is full|no space)"), atomic_write(old):
         with open("/dev/full", "wb") as file:
             file.write(b"x" * 100_000)
     assert_untouched(old)
 
 
-def test_a_file_that_may_not_grow_is_one_sentence(old):
-    """As a quota says it, whether Python or torch writes."""
+def test_file_size_limit_is_reported(old):
+    """A limit of the file size stands in for a quota. Python and torch raise different errors."""
     import resource
 
     import torch
@@ -115,7 +115,7 @@ def test_a_file_that_may_not_grow_is_one_sentence(old):
         assert_untouched(old)
 
 
-def test_the_data_is_on_disk_before_the_name_and_the_name_before_the_end(old, monkeypatch):
+def test_file_is_synced_before_the_rename_and_its_folder_after(old, monkeypatch):
     happened = []
     fsync, replace = os.fsync, os.replace
 
@@ -129,7 +129,7 @@ def test_the_data_is_on_disk_before_the_name_and_the_name_before_the_end(old, mo
     assert happened == ["file", "rename", "folder"]
 
 
-def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
+def test_remove_temporary_deletes_only_leftovers_of_that_file(tmp_path):
     for name in (".mesh.abc.tmp.ply", ".mesh_visible.abc.tmp.ply", ".mesh.abc.tmp.obj", "mesh.ply", "mesh.tmp.ply"):
         (tmp_path / name).touch()
     remove_temporary(tmp_path / "mesh.ply")
@@ -137,13 +137,13 @@ def test_what_a_kill_left_is_removed_and_nothing_else(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == left
 
 
-def test_a_folder_that_is_a_file_is_one_sentence(old):
+def test_write_below_a_file_is_refused(old):
     with pytest.raises(LinprimError, match="mesh.ply"), atomic_write(old / "inside.json") as temporary:
         temporary.write_text("new")
     assert_untouched(old)
 
 
-def test_what_is_written_below_a_file_names_the_file(old):
+def test_locked_names_the_file_in_place_of_a_folder(old):
     for name in ("", "mesh.ply"):
         with (
             pytest.raises(LinprimError, match=r"mesh\.ply: is a file, wanted a folder"),
@@ -153,7 +153,7 @@ def test_what_is_written_below_a_file_names_the_file(old):
     assert_untouched(old)
 
 
-def test_json_holds_what_json_cannot(tmp_path):
+def test_write_json_converts_arrays_paths_and_non_finite_numbers(tmp_path):
     import numpy as np
 
     value = {

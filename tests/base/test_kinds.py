@@ -1,4 +1,4 @@
-"""Kinds of primitives: reference lengths against geometry computed another way."""
+"""Kinds of primitives: reference lengths compared with closed forms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from linprim_geo.base.kinds import KINDS
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-5, 5), min_size=4, max_size=4))
-def test_the_reference_length_of_a_tetrahedron_is_its_inscribed_spheres_diameter(logs):
+def test_reference_length_of_a_tetrahedron_is_the_diameter_of_its_inscribed_sphere(logs):
     extent = np.exp([logs])
     vertices = extent.T * KINDS["tetrahedron"].directions
     volume = abs(np.linalg.det(vertices[1:] - vertices[0])) / 6
@@ -22,8 +22,7 @@ def test_the_reference_length_of_a_tetrahedron_is_its_inscribed_spheres_diameter
         np.linalg.norm(np.cross(vertices[b] - vertices[a], vertices[c] - vertices[a])) / 2
         for a, b, c in KINDS["tetrahedron"].faces
     )
-    # The determinant loses what its products cancel: 1e-16 times the ratio of the largest to the smallest volume in it,
-    # e^15.
+    # Cancellation in the determinant: 1e-16 times the ratio of the largest to the smallest volume, at most e^15.
     tolerance = 1e-9
     assert KINDS["tetrahedron"].reference_length(extent)[0] == pytest.approx(6 * volume / area, rel=tolerance)
     # numpy and torch agree, and the length is homogeneous of degree 1.

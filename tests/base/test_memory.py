@@ -1,4 +1,4 @@
-"""Memory and cores: the machine's, and the limits of control groups of both versions, read from made-up files."""
+"""Memory and cores of the machine and limits of control groups v1 and v2, read from synthetic files."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def write(root, files):
 
 
 def stat(inactive, active, prefix=""):
-    """A memory.stat: cache holds shared memory too, which cannot be given up."""
+    """Text of memory.stat. Its cache includes shared memory, which cannot be reclaimed."""
     text = f"cache {5000 * MIB}\nshmem {4000 * MIB}\ninactive_anon {9 * MIB}\n"
     return text + f"{prefix}inactive_file {inactive * MIB}\n{prefix}active_file {active * MIB}"
 
 
-def test_without_control_groups_the_machine_counts(machine, tmp_path):
+def test_without_control_groups_the_machine_sets_the_limits(machine, tmp_path):
     assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
 
 
-def test_a_container_of_version_2_limits_memory_and_cores(machine, tmp_path):
-    """A container sees its own group as the root of the hierarchy."""
+def test_cgroup_v2_limits_memory_and_cores(machine, tmp_path):
+    """Inside a container its own group is the root of the hierarchy."""
     write(tmp_path, {"proc/self/cgroup": "0::/"})
     group = "sys/fs/cgroup"
     write(tmp_path, {f"{group}/memory.max": 3000 * MIB, f"{group}/memory.current": 2900 * MIB})
@@ -58,8 +58,8 @@ def test_a_container_of_version_2_limits_memory_and_cores(machine, tmp_path):
     assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
 
 
-def test_the_tightest_group_above_counts(machine, tmp_path):
-    """A service in a slice: the slice has the limit of memory, the service that of cores."""
+def test_tightest_limit_of_all_parent_groups_applies(machine, tmp_path):
+    """The slice limits the memory, and the service inside it limits the cores."""
     write(tmp_path, {"proc/self/cgroup": "0::/work.slice/job.service"})
     slices, job = "sys/fs/cgroup/work.slice", "sys/fs/cgroup/work.slice/job.service"
     write(tmp_path, {f"{slices}/memory.max": 4000 * MIB, f"{slices}/memory.current": 1500 * MIB})
@@ -73,8 +73,8 @@ def test_the_tightest_group_above_counts(machine, tmp_path):
 
 
 @pytest.mark.parametrize("inside", [False, True])
-def test_version_1_has_a_hierarchy_per_controller(inside, machine, tmp_path):
-    """Inside a container the names in /proc are those of the host, and the group is at the root of what is mounted."""
+def test_cgroup_v1_limits_are_read_per_controller(inside, machine, tmp_path):
+    """Inside a container /proc names the groups of the host, but the group itself is the root of the mount."""
     write(tmp_path, {"proc/self/cgroup": "4:memory:/docker/abc\n3:cpu,cpuacct:/docker/abc\n1:name=systemd:/x\n0::/"})
     name = "" if inside else "/docker/abc"
     memory, cores = f"sys/fs/cgroup/memory{name}", f"sys/fs/cgroup/cpu{name}"
@@ -86,21 +86,21 @@ def test_version_1_has_a_hierarchy_per_controller(inside, machine, tmp_path):
     assert (available_memory(tmp_path), total_memory(tmp_path), usable_cores(tmp_path)) == (FREE, TOTAL, 8)
 
 
-def test_controllers_that_share_a_hierarchy_are_found_by_either_name(machine, tmp_path):
+def test_cgroup_v1_controllers_may_share_a_hierarchy(machine, tmp_path):
     write(tmp_path, {"proc/self/cgroup": "3:cpu,cpuacct:/job"})
     cores = "sys/fs/cgroup/cpu,cpuacct/job"
     write(tmp_path, {f"{cores}/cpu.cfs_quota_us": 150000, f"{cores}/cpu.cfs_period_us": 100000})
     assert usable_cores(tmp_path) == 2 and core_quota(tmp_path) == 1.5
 
 
-def test_what_slows_a_process_down_limits_its_memory(machine, tmp_path):
+def test_memory_high_limits_memory(machine, tmp_path):
     group = "sys/fs/cgroup"
     write(tmp_path, {"proc/self/cgroup": "0::/", f"{group}/memory.max": "max", f"{group}/memory.high": 2000 * MIB})
     write(tmp_path, {f"{group}/memory.current": 500 * MIB})
     assert (available_memory(tmp_path), total_memory(tmp_path)) == (1500 * MIB, 2000 * MIB)
 
 
-def test_containers_say_what_they_are(monkeypatch, tmp_path):
+def test_kind_of_container_is_detected(monkeypatch, tmp_path):
     monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
     assert container(tmp_path) is None
     write(tmp_path, {"run/systemd/container": "lxc"})
@@ -111,14 +111,14 @@ def test_containers_say_what_they_are(monkeypatch, tmp_path):
     assert container(tmp_path) == "docker"
 
 
-def test_the_core_begins_with_the_cores_that_may_be_used():
+def test_kernels_use_at_most_the_cores_of_the_affinity_mask():
     program = "import os; os.cpu_count = lambda: 9; os.sched_getaffinity = lambda pid: set(range(3))\n"
     program += "from linprim_geo.kernels import ops; print(ops.threads())"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "3\n" or usable_cores() < 3
 
 
-def test_more_in_use_than_the_limit_leaves_nothing(machine, tmp_path):
+def test_usage_above_the_limit_leaves_no_memory(machine, tmp_path):
     group = "sys/fs/cgroup"
     write(tmp_path, {"proc/self/cgroup": "0::/", f"{group}/memory.max": 10 * MIB})
     write(tmp_path, {f"{group}/memory.current": 12 * MIB})
@@ -126,7 +126,7 @@ def test_more_in_use_than_the_limit_leaves_nothing(machine, tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "0:", "0::/../../other"])
-def test_files_that_say_nothing_limit_nothing(text, machine, tmp_path):
+def test_malformed_control_group_files_set_no_limit(text, machine, tmp_path):
     group = "sys/fs/cgroup"
     write(tmp_path, {"proc/self/cgroup": text, f"{group}/memory.max": "?", f"{group}/memory.current": ""})
     write(tmp_path, {f"{group}/cpu.max": "many"})
@@ -138,10 +138,10 @@ def test_this_machine_has_memory_and_cores():
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/clear_refs"), reason="the peak can be forgotten on Linux alone")
-def test_the_peak_is_of_what_came_after_the_last_one():
+def test_forget_peak_resets_the_peak_of_memory():
     held = np.ones(2**26)  # half a GiB
     resident = memory_gib()
-    with_array = peak_gib()  # after it: a reading takes pages itself
+    with_array = peak_gib()  # read second, because a reading allocates pages itself
     assert with_array >= resident > held.nbytes / 2**30
     del held
     assert peak_gib() == pytest.approx(with_array, abs=0.1)
@@ -150,8 +150,8 @@ def test_the_peak_is_of_what_came_after_the_last_one():
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators are left alone")
-def test_memory_that_is_freed_is_given_back():
-    """Arrays of 1 MiB, with small ones between that stay, come from the heap once a larger one was freed."""
+def test_give_back_returns_freed_memory_to_the_system():
+    """Once a larger array was freed, arrays of 1 MiB come from the heap, which small arrays between them fragment."""
     program = """
 import numpy as np
 from linprim_geo.base.memory import give_back, memory_gib

@@ -1,4 +1,4 @@
-"""Options: their ranges stand beside their defaults, and what is outside is one sentence."""
+"""Options with defaults and ranges. A value outside its range is refused with one sentence."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_a_value_outside_its_range_is_one_sentence(wrong, sentence):
         with_changes(Options, None, wrong)
 
 
-def test_ends_of_a_range_defaults_and_numbers_of_numpy_are_taken():
+def test_range_limits_defaults_and_numpy_numbers_are_accepted():
     for options in (
         Options(),
         Options(count=2, share=0, level=0.1, size=1),
@@ -72,14 +72,14 @@ def test_ends_of_a_range_defaults_and_numbers_of_numpy_are_taken():
 
 
 @pytest.mark.parametrize("cls", [SceneOptions, TrainOptions, ExtractOptions])
-def test_every_default_is_allowed_and_every_number_has_a_range(cls):
+def test_every_default_is_valid_and_every_number_has_a_range(cls):
     check(cls())
     for entry in fields(cls):
         if not isinstance(entry.default, str | bool) and not entry.metadata["choices"]:
             assert entry.metadata["low"] is not None, entry.name
 
 
-def test_flags_set_what_differs_from_its_default():
+def test_flags_list_only_options_that_differ_from_their_defaults():
     from argparse import ArgumentParser
 
     from linprim_geo.cli.arguments import from_args
@@ -96,12 +96,12 @@ def test_flags_set_what_differs_from_its_default():
     )
 
 
-def test_values_that_exclude_each_other_are_refused():
+def test_contradictory_options_are_refused():
     with pytest.raises(LinprimError, match="--initial-primitives is 20, wanted at most --max-primitives, 10"):
         check_train_options(TrainOptions(initial_primitives=20, max_primitives=10))
 
 
-def test_what_a_file_holds_has_the_types_of_the_options():
+def test_saved_options_are_converted_to_the_types_of_the_fields():
     assert from_saved(Options, {"level": 0.5, "size": 2, "gone": 1}, "f") == Options(level=0.5, size=2.0)
     assert from_saved(Options, {"level": "auto", "size": None}, "f") == Options()
     for wrong in ({"count": 1.5}, {"kind": 3}, {"level": "best"}, {"count": None}):

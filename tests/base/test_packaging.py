@@ -1,4 +1,4 @@
-"""What goes into the source distribution, which wheels are built from."""
+"""Content of the source distribution, from which wheels are built."""
 
 import tomllib
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_no_pattern_leaves_a_package_out_of_the_source_distribution():
+def test_source_distribution_contains_every_file_of_the_packages():
     pathspec = pytest.importorskip("pathspec", reason="comes with mypy, of the extra dev")
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["scikit-build"]
     left_out = pathspec.GitIgnoreSpec.from_lines(settings["sdist"]["exclude"])

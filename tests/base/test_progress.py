@@ -1,4 +1,4 @@
-"""Progress of long jobs, as a log and a terminal show it."""
+"""Progress of long jobs in a log and on a terminal."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from linprim_geo.base.progress import Progress, duration
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (184, "3:04"), (3723, "1:02:03")])
-def test_durations_are_short(seconds, text):
+def test_durations_are_formatted(seconds, text):
     assert duration(seconds) == text
 
 
-def test_long_stages_are_told_when_they_begin(capsys):
+def test_stages_are_logged_when_they_begin(capsys):
     progress = Progress("merging", 2)
     progress.stage(0, "planes")
     progress.update(1)  # too soon after the line before
@@ -23,7 +23,7 @@ def test_long_stages_are_told_when_they_begin(capsys):
     assert capsys.readouterr().err.splitlines() == ["merging 1/2  planes", "merging 2/2  walls"]
 
 
-def test_a_terminal_has_one_line_that_is_cleared(capsys, monkeypatch):
+def test_terminal_shows_one_line_and_clears_it(capsys, monkeypatch):
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     progress = Progress("merging", 2)
     progress.stage(0, "gaps between planes")
@@ -34,7 +34,7 @@ def test_a_terminal_has_one_line_that_is_cleared(capsys, monkeypatch):
     assert "\r" + "merging 2/2  walls".ljust(len("merging 1/2  gaps between planes")) + "\r" in shown
 
 
-def test_a_log_on_a_full_disk_ends_no_job_and_a_closed_pipe_does(monkeypatch):
+def test_full_disk_of_the_log_is_ignored_and_a_closed_pipe_raises(monkeypatch):
     def failing(error):
         def write(*_):
             raise error
@@ -51,7 +51,7 @@ def test_a_log_on_a_full_disk_ends_no_job_and_a_closed_pipe_does(monkeypatch):
         progress.note("a line")
 
 
-def test_what_came_before_the_first_step_is_not_in_the_time_left(capsys, monkeypatch):
+def test_time_left_excludes_the_time_before_the_first_step(capsys, monkeypatch):
     now = [0.0]
     monkeypatch.setattr("linprim_geo.base.progress.time.monotonic", lambda: now[0])
     progress = Progress("train", 100)

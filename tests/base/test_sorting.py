@@ -8,7 +8,7 @@ from linprim_geo.base.sorting import distinct
 
 @pytest.mark.parametrize("dtype", [np.int64, np.int32, np.uint8])
 @pytest.mark.parametrize("size", [0, 1, 2, 1000])
-def test_distinct_is_the_set_in_order(dtype, size):
+def test_distinct_returns_sorted_unique_values_and_keeps_its_input(dtype, size):
     values = np.random.default_rng(size).integers(0, 100, size).astype(dtype)
     kept = values.copy()
     found = distinct(values)
