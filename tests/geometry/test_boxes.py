@@ -1,4 +1,4 @@
-"""Blocks fill space, share the work, and take of a view what shows them."""
+"""Blocks that partition space and work, and the windows of views that show them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def camera(width=40, height=30) -> Camera:
 
 
 @pytest.mark.parametrize("count", [2, 3, 5, 9])
-def test_blocks_fill_space_once_and_share_the_work(count):
+def test_blocks_partition_space_and_share_the_work_evenly(count):
     xyz = RNG.normal(size=(4000, 3)) * [5, 2, 1]
     work = RNG.uniform(0.1, 3.0, 4000)
     blocks = split_space(xyz, work, count)
@@ -40,7 +40,7 @@ def test_blocks_fill_space_once_and_share_the_work(count):
     assert (np.stack([block.holds(far) for block in blocks]).sum(0) == 1).all()
 
 
-def test_the_longest_side_is_cut_where_the_work_is_half():
+def test_split_halves_the_work_along_the_longest_side():
     xyz = np.stack([np.linspace(0, 10, 1001), np.zeros(1001), np.zeros(1001)], 1)
     work = np.where(xyz[:, 0] > 8, 4.0, 1.0)  # 2 parts of work in the last fifth
     low, high = split_space(xyz, work, 2)
@@ -48,7 +48,7 @@ def test_the_longest_side_is_cut_where_the_work_is_half():
     assert abs(low.high[0] - 8.0) < 0.02  # 800 of the 1600 lie below
 
 
-def test_a_margin_grows_a_block_on_all_sides():
+def test_margin_extends_a_block_on_all_sides():
     block = Block((0.0, -np.inf, -np.inf), (1.0, np.inf, 2.0))
     points = np.array([[-0.05, 0, 0], [1.05, 0, 0], [0.5, 99, 2.05], [0.5, 0, 2.2], [-0.2, 0, 0]])
     assert not block.holds(points).any()
@@ -60,21 +60,21 @@ def test_a_margin_is_a_fifth_of_the_longest_side():
     assert margin_of(split_space(xyz, np.ones(20000), 4), xyz) == pytest.approx(0.2 * 0.98 * 2.0, rel=0.02)
 
 
-def test_more_blocks_than_places_are_refused():
+def test_more_blocks_than_distinct_points_are_refused():
     with pytest.raises(LinprimError, match="--blocks is too large: .* wanted fewer blocks"):
         split_space(np.zeros((50, 3)), np.ones(50), 2)
     with pytest.raises(LinprimError, match="--blocks is too large"):
         split_space(RNG.normal(size=(5, 3)), np.ones(5), 8)
 
 
-def test_the_work_of_a_point_is_the_pixels_of_the_views_that_see_it():
+def test_work_of_a_point_is_the_number_of_pixels_of_views_that_see_it():
     view, depth = camera(), np.full((30, 40), 4.0)
     depth[:, 20:] = 0  # nothing is known on the right
     xyz = np.array([[-0.2, 0, 4.0], [-0.2, 0, 4.3], [-0.4, 0, 8.0], [0.4, 0, 8.0], [0, 0, -4.0], [9, 0, 4.0]])
     assert point_work(xyz, [(view, depth, 1200)] * 2).tolist() == [2400, 2400, 0, 2400, 0, 0]
 
 
-def test_pixels_show_a_block_where_their_surface_lies_in_it():
+def test_pixels_belong_to_the_block_that_holds_their_surface_point():
     depth = np.full((30, 40), 4.0)
     depth[:10] = 0
     surface = surface_points(camera(), depth)
@@ -85,7 +85,7 @@ def test_pixels_show_a_block_where_their_surface_lies_in_it():
     assert not Block((-np.inf, -np.inf, 5.0), (np.inf,) * 3).holds(surface).any()
 
 
-def test_a_window_is_the_part_of_a_photograph_that_shows_a_block():
+def test_window_is_the_part_of_a_photograph_that_shows_a_block():
     view, mask = camera(80, 60), np.zeros((30, 40), dtype=bool)
     assert window(mask, view, 2) is None
     mask[14, 10:16] = True
@@ -100,7 +100,7 @@ def test_a_window_is_the_part_of_a_photograph_that_shows_a_block():
     assert window(mask, view, 2) == (0, 0, 80, 60) and enlarged(mask, view, 2).all()
 
 
-def test_blocks_are_apart_by_what_lies_between_them():
+def test_distance_between_blocks_and_from_points_to_a_block():
     near, far = Block((-np.inf, 0.0, 0.0), (1.0, 1.0, 1.0)), Block((1.5, -1.0, -np.inf), (2.0, 5.0, np.inf))
     assert near.is_apart(far, 0.4) and far.is_apart(near, 0.4)
     assert not near.is_apart(far, 0.6) and not far.is_apart(near, 0.6)
@@ -110,7 +110,7 @@ def test_blocks_are_apart_by_what_lies_between_them():
     assert np.array_equal(near.holds(points, 0.75), near.distance(points) < 0.75)
 
 
-def test_the_cut_camera_sees_the_same_through_its_pixels():
+def test_cropped_and_smaller_cameras_project_consistently():
     view = camera(81, 61)
     part, half = cropped(view, 7, 5, 30, 20), smaller(view, 2)
     points = np.array([[0.1, -0.2, 3.0], [-0.4, 0.3, 5.0]])

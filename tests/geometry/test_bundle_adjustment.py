@@ -1,4 +1,4 @@
-"""Bundle adjustment of given poses: gradients, exact poses, wrong ones, wrong matches, and what is not seen."""
+"""Bundle adjustment of given poses: Jacobians, exact and wrong poses, wrong matches and unseen cameras."""
 
 from __future__ import annotations
 
@@ -43,15 +43,17 @@ def seen(cameras, rng, count=600, noise=0.3, wrong=0.0, most_views=6) -> Observe
     return ObservedPoints(xyz, np.zeros((count, 3), np.uint8), np.zeros(count, np.float32), point, image, pixel)
 
 
-def shaken(cameras, rng, error_px: float) -> list[Camera]:
-    """Each with an error of its own, half of its square by turning and half by moving: two axes of each show."""
+def perturbed(cameras, rng, error_px: float) -> list[Camera]:
+    """Cameras with independent errors. Rotation and translation each cause half of the squared error."""
     deviation = error_px / 2 / FOCAL
     return [_moved(camera, rng.normal(0, deviation, 6) * [1, 1, 1, 3, 3, 3]) for camera in cameras]
 
 
-def off_px(cameras, true) -> float:
-    """By how far they see points of the ball from where the true ones do: root mean square, best similarity of the
-    world aside, which is small here."""
+def projection_error_px(cameras, true) -> float:
+    """Root mean square distance in pixels between projections of points of the ball by given and by true cameras.
+
+    The similarity of the world is not removed. It is small here.
+    """
     xyz = np.random.default_rng(9).uniform(-0.5, 0.5, (200, 3))
     return float(
         np.sqrt(np.mean([(a.project(xyz)[0] - b.project(xyz)[0]) ** 2 for a, b in zip(cameras, true, strict=True)]) * 2)
@@ -59,7 +61,7 @@ def off_px(cameras, true) -> float:
 
 
 @pytest.mark.parametrize("precise", [False, True])
-def test_equations_against_finite_differences(precise):
+def test_jacobians_agree_with_finite_differences(precise):
     rng = np.random.default_rng(0)
     cameras = cameras_around(3)
     points = seen(cameras, rng, 5, noise=0.0, most_views=3)
@@ -83,7 +85,7 @@ def test_equations_against_finite_differences(precise):
 
 
 @pytest.mark.parametrize("radial", [None, 0.02])
-def test_the_reduced_equations_are_those_of_cameras_and_points_together(radial):
+def test_schur_complement_agrees_with_the_full_system(radial):
     rng = np.random.default_rng(1)
     known = 25 if radial is None else 26
     cameras, information = cameras_around(4), rng.uniform(1e5, 9e5, known)
@@ -105,33 +107,33 @@ def test_the_reduced_equations_are_those_of_cameras_and_points_together(radial):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_wrong_poses_are_found_and_their_error_is_told(seed):
-    """Left are 0.14 to 0.23 of 0.60 to 0.74 pixels with a tenth of wrong matches; told are 0.67 to 0.76."""
+def test_pose_errors_are_reduced_and_estimated(seed):
+    """With a tenth of wrong matches, errors of 0.60 to 0.74 px fall to 0.14 to 0.23 px. Estimated: 0.67 to 0.76 px."""
     rng = np.random.default_rng(seed)
     true = cameras_around()
-    given = shaken(true, rng, 0.8)
+    given = perturbed(true, rng, 0.8)
     found = bundle_adjusted(given, placed_points(given, seen(true, rng, wrong=0.1)))
-    assert off_px(found.cameras, true) < 0.35 * off_px(given, true)
-    assert found.error_px == pytest.approx(off_px(given, true), rel=0.25)
+    assert projection_error_px(found.cameras, true) < 0.35 * projection_error_px(given, true)
+    assert found.error_px == pytest.approx(projection_error_px(given, true), rel=0.25)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wrong_focal_length_is_found(seed):
-    """Of 6 thousandths 0.3 to 1.7 are left."""
+def test_focal_length_is_corrected(seed):
+    """Of a relative error of 6e-3, between 0.3e-3 and 1.7e-3 are left."""
     rng = np.random.default_rng(seed)
     true = cameras_around()
-    given = [replace(camera, fx=1.006 * camera.fx, fy=1.006 * camera.fy) for camera in shaken(true, rng, 0.5)]
+    given = [replace(camera, fx=1.006 * camera.fx, fy=1.006 * camera.fy) for camera in perturbed(true, rng, 0.5)]
     found = bundle_adjusted(given, placed_points(given, seen(true, rng, 3000, wrong=0.05, most_views=12)))
     assert found.focal_factor * 1.006 == pytest.approx(1, abs=0.0025)
     assert found.cameras[0].fx == pytest.approx(found.focal_factor * given[0].fx)
 
 
-def test_observations_that_are_more_exact_count_more():
-    """Half of the observations are twenty times as noisy along one axis: 0.31 pixels are left, and 0.20 where their
-    precision says so."""
+def test_precise_observations_have_a_larger_weight():
+    """Half of the observations are twenty times as noisy along one axis. The remaining error is 0.31 px, and 0.20 px
+    with their precision given."""
     rng = np.random.default_rng(3)
     true = cameras_around()
-    given, points = shaken(true, rng, 0.8), seen(true, rng, noise=0.1)
+    given, points = perturbed(true, rng, 0.8), seen(true, rng, noise=0.1)
     noisy = rng.random(len(points.point)) < 0.5
     turn = rng.uniform(0, np.pi, len(points.point))
     along = np.stack([np.cos(turn), np.sin(turn)], 1) * noisy[:, None]
@@ -139,23 +141,25 @@ def test_observations_that_are_more_exact_count_more():
     precision = np.eye(2) - 0.95 * along[:, :, None] * along[:, None]
     told = bundle_adjusted(given, placed_points(given, replace(points, precision=precision)))
     alike = bundle_adjusted(given, placed_points(given, points))
-    assert off_px(told.cameras, true) < 0.8 * off_px(alike.cameras, true)
+    assert projection_error_px(told.cameras, true) < 0.8 * projection_error_px(alike.cameras, true)
     assert replace(points, precision=precision).chosen(points.track_length > 3).precision.shape[1:] == (2, 2)
 
 
-def test_observations_that_err_together_say_less():
-    """All that a camera sees is shifted alike, by 0.3 pixels where each alone errs by 0.02: that the given poses are
-    exact counts for more where that is known. Off are 0.008 and 0.44 pixels."""
+def test_common_errors_of_observations_reduce_their_weight():
+    """All observations of a camera share a shift of 0.3 px; their own noise is 0.02 px.
+
+    With the common error modelled, the given exact poses weigh more: the error is 0.008 instead of 0.44 px.
+    """
     rng = np.random.default_rng(6)
     true = cameras_around()
     points = seen(true, rng, noise=0.02)
     points = replace(points, pixel=points.pixel + rng.normal(0, 0.3, (len(true), 2))[points.image])
     alone, shared = (bundle_adjusted(true, placed_points(true, points), common=share) for share in (0, 225))
-    assert off_px(shared.cameras, true) < 0.1 * off_px(alone.cameras, true)
+    assert projection_error_px(shared.cameras, true) < 0.1 * projection_error_px(alone.cameras, true)
 
 
-def test_few_observations_count_for_more_each_where_all_err_together():
-    """Of n observations of a camera each has 1 / (1 + n common) of the weight."""
+def test_weight_of_an_observation_depends_on_their_number_under_common_errors():
+    """Each of the n observations of a camera has its weight multiplied by 1 / (1 + n common)."""
     rng = np.random.default_rng(8)
     cameras = cameras_around(4)
     points = seen(cameras, rng, 40, most_views=4)
@@ -168,56 +172,57 @@ def test_few_observations_count_for_more_each_where_all_err_together():
 
 
 @pytest.mark.parametrize("factor", [0.995, 1.0])
-def test_a_known_focal_length_stays_as_far_as_it_is_known(factor):
-    """Of 40 points: what is known to 0.00001 decides, what is known to 0.003 is told better by the points, and the
-    deviation says how far."""
+def test_prior_of_the_focal_length_is_weighted_by_its_deviation(factor):
+    """A prior with a deviation of 1e-5 outweighs 40 points. One with 3e-3 does not, and the estimated deviation bounds
+    the error."""
     rng = np.random.default_rng(7)
     true = cameras_around()
-    given = [replace(camera, fx=camera.fx / factor, fy=camera.fy / factor) for camera in shaken(true, rng, 0.5)]
+    given = [replace(camera, fx=camera.fx / factor, fy=camera.fy / factor) for camera in perturbed(true, rng, 0.5)]
     points = placed_points(given, seen(true, rng, 40))
     loose, firm = (bundle_adjusted(given, points, focal=(factor, deviation)) for deviation in (0.003, 1e-5))
     assert firm.focal_factor == pytest.approx(factor, abs=3e-5) and firm.focal_deviation < 1e-5
     assert firm.focal_deviation < loose.focal_deviation < 0.003
     assert abs(loose.focal_factor - factor) < 3 * loose.focal_deviation
-    assert off_px(firm.cameras, true) < off_px(given, true)
+    assert projection_error_px(firm.cameras, true) < projection_error_px(given, true)
     assert firm.cameras[0].fx == pytest.approx(firm.focal_factor * given[0].fx)
 
 
 @pytest.mark.parametrize("seed", [4, 5])
-def test_a_radial_distortion_and_poses_of_any_error_are_found(seed):
-    """One camera is off by 35 pixels, and by 0.18 and 0.27 in the end, as all are where nothing holds the world; of k1
-    0.1 some 0.003 and 0.009 are left, and of 4 thousandths of the focal length 0.2 to 0.6, without k1 1 and 2.4."""
+def test_radial_distortion_and_large_pose_errors_are_corrected(seed):
+    """One camera starts with an error of 35 px and ends with 0.18 and 0.27 px, like all others, as nothing fixes the
+    world frame. k1 = 0.1 is found within 0.003 and 0.009. Of a relative error of 4e-3 of the focal length, 0.2e-3 to
+    0.6e-3 are left; 1e-3 and 2.4e-3 without k1."""
     rng = np.random.default_rng(seed)
     true = cameras_around()
     points = seen(true, rng, 3000, noise=0.2, most_views=12)
     inner = np.array([(camera.fx, camera.cx, camera.cy) for camera in true])[points.image]
     ray = (points.pixel - inner[:, 1:]) / inner[:, :1]
     points = replace(points, pixel=points.pixel + 0.1 * (ray**2).sum(1, keepdims=True) * ray * inner[:, :1])
-    given = [replace(camera, fx=1.004 * camera.fx, fy=1.004 * camera.fy) for camera in shaken(true, rng, 0.3)]
+    given = [replace(camera, fx=1.004 * camera.fx, fy=1.004 * camera.fy) for camera in perturbed(true, rng, 0.3)]
     given[7] = _moved(given[7], np.array([0.1, 0, 0, 0, 0, 0]))
-    assert off_px(given[7:8], true[7:8]) > 30
+    assert projection_error_px(given[7:8], true[7:8]) > 30
     found, without = (
         bundle_adjusted(given, placed_points(given, points), focal=(1.0, 0.1), pose_error=20.0, radial_error=error)
         for error in (0.1, 0.0)
     )
-    assert found.error_px == pytest.approx(20) and off_px(found.cameras[7:8], true[7:8]) < 0.4
+    assert found.error_px == pytest.approx(20) and projection_error_px(found.cameras[7:8], true[7:8]) < 0.4
     assert found.radial == pytest.approx(0.1, abs=0.012) and without.radial == 0
     assert abs(found.focal_factor * 1.004 - 1) < min(0.001, 0.7 * abs(without.focal_factor * 1.004 - 1))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_exact_poses_stay(seed):
-    """Told are 0.05 pixels, and what they see moves by 0.05 to 0.10, as focal lengths change by 0.1 to 0.2 %."""
+def test_exact_poses_hardly_change(seed):
+    """The estimated error is 0.05 px. Projections move by 0.05 to 0.10 px, as focal lengths change by 0.1 to 0.2 %."""
     rng = np.random.default_rng(seed)
     true = cameras_around()
     found = bundle_adjusted(true, seen(true, rng, wrong=0.05))
-    assert found.error_px < 0.12 and off_px(found.cameras, true) < 0.15
+    assert found.error_px < 0.12 and projection_error_px(found.cameras, true) < 0.15
 
 
-def test_the_same_comes_out_each_time_and_unseen_cameras_stay():
+def test_result_is_repeatable_and_cameras_without_observations_stay():
     rng = np.random.default_rng(5)
     true = cameras_around(10)
-    given, points = shaken(true, rng, 0.6), seen(true[:8], rng)
+    given, points = perturbed(true, rng, 0.6), seen(true[:8], rng)
     first, second = bundle_adjusted(given, points), bundle_adjusted(given, points)
     for one, other in zip(first.cameras, second.cameras, strict=True):
         assert (one.world_to_camera == other.world_to_camera).all()
@@ -227,7 +232,7 @@ def test_the_same_comes_out_each_time_and_unseen_cameras_stay():
         np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
 
 
-def test_points_are_placed_where_cameras_see_them():
+def test_placed_points_minimises_the_reprojection_error():
     rng = np.random.default_rng(6)
     cameras = cameras_around()
     points = seen(cameras, rng, noise=0.0)

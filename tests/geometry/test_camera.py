@@ -1,4 +1,4 @@
-"""Where a camera shows points."""
+"""Projection of points by a camera."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def camera() -> Camera:
     return Camera(30, 20, 25.0, 27.0, 14.2, 10.7, pose)
 
 
-def test_points_on_the_rays_of_pixels_are_in_their_middles(camera):
+def test_points_on_pixel_rays_project_to_pixel_centres(camera):
     depth = np.random.default_rng(0).uniform(0.5, 5, (20, 30))
     points = (camera.center + camera.world_rays() * depth[..., None]).reshape(-1, 3)
     pixels, along = camera.project(points)
@@ -26,7 +26,7 @@ def test_points_on_the_rays_of_pixels_are_in_their_middles(camera):
     assert camera.shows(pixels, along).all()
 
 
-def test_what_is_behind_or_beside_is_not_shown(camera):
+def test_points_behind_the_camera_or_outside_the_image_are_not_shown(camera):
     points = camera.center + np.array([[0, 0, -1], [9, 0, 1], [0, 0, 1.0]]) @ camera.rotation
     pixels, along = camera.project(points)
     assert np.isnan(pixels[0]).all() and np.isfinite(pixels[2]).all()
@@ -36,7 +36,7 @@ def test_what_is_behind_or_beside_is_not_shown(camera):
 
 
 @pytest.mark.parametrize("margin", [0.0, 1.0])
-def test_the_border_belongs_to_the_image_above_and_at_the_left(camera, margin):
+def test_image_includes_its_left_and_top_border_only(camera, margin):
     low, high = margin, np.array([30, 20]) - margin
     corners = np.array(
         [[low, low], [high[0], low], [low, high[1]], np.nextafter(high, 0), [np.nextafter(low, -1), low]]

@@ -1,4 +1,4 @@
-"""Matches of descriptors against COLMAP's rule, one pair at a time in float64."""
+"""Matches of descriptors compared with COLMAP's rule, applied to one pair at a time in float64."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def one_way(ours: np.ndarray, theirs: np.ndarray) -> dict[int, int]:
     return found
 
 
-def test_matches_follow_the_rule_and_do_not_depend_on_parts(monkeypatch):
+def test_mutual_matches_agree_with_the_reference_for_any_chunk_size(monkeypatch):
     rng = np.random.default_rng(4)
     first = descriptors(rng, 80)
-    # Some are seen again, more or less changed, some twice, in either photograph, and some are others.
+    # Repeated, noisy, duplicated and unrelated descriptors in both photographs.
     first = np.concatenate([first, noisy(rng, first[10:20], 20)])
     second = np.concatenate([noisy(rng, first[:50], 8), noisy(rng, first[40:70], 25), first[:5], descriptors(rng, 30)])
     there, back = one_way(first, second), one_way(second, first)

@@ -1,5 +1,4 @@
-"""Undistorted photographs against the pinhole that is said to have taken them, for every model of
-COLMAP's."""
+"""Undistorted photographs compared with projections of their pinhole camera, for every camera model of COLMAP."""
 
 from __future__ import annotations
 
@@ -46,7 +45,7 @@ def test_every_model_is_covered():
 
 
 @pytest.mark.parametrize("model", list(LENSES))
-def test_blobs_are_where_the_pinhole_sees_them(tmp_path, model):
+def test_blobs_of_undistorted_images_lie_at_pinhole_projections(tmp_path, model):
     import pycolmap
 
     lens = Lens(model, *SIZE, tuple(float(value) for value in LENSES[model]))
@@ -81,7 +80,7 @@ def test_blobs_are_where_the_pinhole_sees_them(tmp_path, model):
         assert np.linalg.norm(centroid - p) < TOLERANCE_PX
 
 
-def test_a_lens_without_distortion_is_used_as_it_is():
+def test_lens_without_distortion_keeps_its_parameters():
     for model, params in (("OPENCV", (F, F, X, Y, 0, 0, 0, 0)), ("SIMPLE_RADIAL", (F, X, Y, 0))):
         target = undistorted(Lens(model, *SIZE, tuple(map(float, params))))
         assert (target.width, target.height, target.cx, target.cy) == (*SIZE, X, Y)
@@ -99,11 +98,11 @@ def test_a_lens_without_distortion_is_used_as_it_is():
         (Lens("PINHOLE", 0, 4, (1.0, 1.0, 2.0, 2.0)), "image size 0x4"),
     ],
 )
-def test_what_cannot_be_a_camera(lens, said):
+def test_invalid_camera_parameters_are_refused(lens, said):
     with pytest.raises(LinprimError, match=said):
         check_lens(lens, "cameras.bin camera 3")
 
 
-def test_a_distortion_that_folds_over_is_refused():
+def test_distortion_that_folds_the_image_is_refused():
     with pytest.raises(LinprimError, match="folds over|cannot be undistorted"):
         undistorted(Lens("OPENCV", *SIZE, (F, F, X, Y, -3.0, 9.0, 0.5, 0.5)))

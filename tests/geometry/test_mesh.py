@@ -1,4 +1,4 @@
-"""Meshes: files as other programs read them, checks before a library sees them, topology in closed form."""
+"""Mesh files as other programs read them, validation of meshes, and topology of known shapes."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def painted(offset=0.0) -> Mesh:
 
 
 @pytest.mark.parametrize("suffix", mesh_files.SUFFIXES)
-def test_a_written_mesh_comes_back(tmp_path, suffix):
+def test_mesh_files_round_trip(tmp_path, suffix):
     mesh = painted()
     mesh_files.save_mesh(tmp_path / f"m{suffix}", mesh)
     back = mesh_files.load_mesh(tmp_path / f"m{suffix}")
@@ -118,7 +118,7 @@ def test_a_mesh_without_attributes_has_none_after_reading(tmp_path):
     assert back.normals is None and back.colors is None and back.quality is None
 
 
-def test_a_moved_and_turned_scene_is_flattened(tmp_path):
+def test_transforms_of_a_scene_are_applied(tmp_path):
     import trimesh
 
     box = trimesh.creation.box()
@@ -135,7 +135,7 @@ def test_a_moved_and_turned_scene_is_flattened(tmp_path):
     assert topology.topology(lm.merge_vertices(mesh_files.load_mesh(tmp_path / "two.glb")))["components"] == 2
 
 
-def test_bad_files_are_named_in_one_sentence(tmp_path):
+def test_damaged_mesh_files_are_refused_by_name(tmp_path):
     with pytest.raises(LinprimError, match="nothing.ply: no such"):
         mesh_files.load_mesh(tmp_path / "nothing.ply")
     mesh_files.save_mesh(tmp_path / "whole.ply", painted())
@@ -182,7 +182,7 @@ def test_bad_faces_are_dropped_and_counted():
     np.testing.assert_array_equal(mesh.faces, good.faces)
 
 
-def test_thin_but_real_faces_stay():
+def test_thin_faces_stay_unless_rounding_collapses_them():
     thin = Mesh([[0, 0, 0], [1, 0, 0], [0.5, 1e-9, 0]], [[0, 1, 2]])
     assert len(lm.validate_mesh(thin).faces) == 1
     # At 1e6 from the origin coordinates step by 1e-10, so 1e-12 is not there any more.
@@ -212,7 +212,7 @@ def test_topology_of_a_cube():
     assert topology.topology(replace(cube(), faces=CUBE_FACES[:, ::-1]))["volume"] == pytest.approx(-1.0)
 
 
-def test_genus_is_that_of_the_surface():
+def test_genus_of_a_torus_and_of_joined_surfaces():
     import trimesh
 
     torus = trimesh.creation.torus(1.0, 0.3)
@@ -222,7 +222,7 @@ def test_genus_is_that_of_the_surface():
     assert (both["genus"], both["components"]) == (1, 3)
 
 
-def test_bodies_that_touch_in_a_vertex_are_two_spheres():
+def test_bodies_that_touch_at_a_vertex_have_genus_zero():
     tetrahedron = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]])
     other = np.array([0, 4, 5, 6])[tetrahedron]
@@ -231,7 +231,7 @@ def test_bodies_that_touch_in_a_vertex_are_two_spheres():
     assert stats["volume"] == pytest.approx(2 / 6)
 
 
-def test_holes_and_fins_are_counted():
+def test_boundary_and_non_manifold_edges_are_counted():
     open_cube = topology.topology(replace(cube(), faces=CUBE_FACES[1:]))
     assert (open_cube["boundary_edges"], open_cube["watertight"], open_cube["genus"]) == (3, False, None)
     assert open_cube["volume"] is None
@@ -246,7 +246,7 @@ def test_holes_and_fins_are_counted():
 # --- editing ---------------------------------------------------------------------------------------------
 
 
-def test_borders_that_touch_in_a_vertex_are_two_loops():
+def test_boundaries_that_touch_at_a_vertex_are_separate_loops():
     # Two triangles that share vertex 2, and a square of two faces.
     faces = np.array([[0, 1, 2], [2, 3, 4], [5, 6, 7], [5, 7, 8]])
     loops = sorted(tuple(sorted(loop.tolist())) for loop in topology.border_loops(faces))
@@ -256,7 +256,7 @@ def test_borders_that_touch_in_a_vertex_are_two_loops():
         assert all((int(a), int(b)) in directed for a, b in zip(loop, np.roll(loop, -1), strict=True))
 
 
-def test_specks_go_and_attributes_follow():
+def test_small_components_are_removed_with_their_attributes():
     big, small = painted(), cube(offset=3.0, scale=0.01)
     mesh = joined(big, small)
     mesh = replace(mesh, quality=np.arange(len(mesh.vertices)))

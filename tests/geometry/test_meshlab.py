@@ -1,4 +1,4 @@
-"""MeshLab reads every file that the commands write, with its counts, normals, colours, quality and textures."""
+"""MeshLab reads every mesh that the commands write: counts, normals, colours, quality and textures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GREY = 178
 
 
 def opened(path: Path) -> pymeshlab.Mesh:
-    """What MeshLab makes of a file, as its current mesh; the set that owns it stays alive with it."""
+    """Load a file with MeshLab and return its current mesh, which keeps the owning set alive."""
     meshes = pymeshlab.MeshSet(verbose=False)
     meshes.load_new_mesh(str(path))
     assert meshes.mesh_number() == 1

@@ -1,4 +1,4 @@
-"""The writer of PLY files: a header by the types of the columns, and rows that other readers find."""
+"""The writer of PLY files: types in the header, and rows that other readers read back."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_columns_are_written_with_their_types(tmp_path):
     assert np.array_equal(found["quality"], columns["quality"], equal_nan=True) and found["label"].tolist() == [-1, 7]
 
 
-def test_tables_longer_than_a_part_and_triangles_with_columns_are_read_back(tmp_path):
+def test_tables_longer_than_one_part_and_columns_of_faces_are_read_back(tmp_path):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(PART + 10, 3)).astype(np.float32)
     faces = rng.integers(0, len(points), (2 * PART + 3, 3))

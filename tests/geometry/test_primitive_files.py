@@ -1,4 +1,4 @@
-"""Files of primitives: the formulas of LinPrim and 3DGS, exact round trips, and files not to be trusted."""
+"""Files of primitives: formulas of LinPrim and 3DGS, exact round trips, and damaged files."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_a_round_trip_through_linprims_file(tmp_path, coefficients):
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-60, np.log(np.log(100.0))))
-def test_densities_survive_up_to_the_cap(tmp_path_factory, log_thickness):
+def test_densities_round_trip_up_to_the_cap(tmp_path_factory, log_thickness):
     path = tmp_path_factory.getbasetemp() / "density.ply"
     before = random_octahedra(3, 1, thickness=np.exp(log_thickness))
     report = write_primitive_ply(path, before)
@@ -82,7 +82,7 @@ def test_densities_survive_up_to_the_cap(tmp_path_factory, log_thickness):
         assert report["clamped"] == 0
 
 
-def test_what_linprim_cannot_hold_is_clamped_and_counted(tmp_path):
+def test_densities_above_the_cap_are_clamped_and_counted(tmp_path):
     thick, thin = random_octahedra(5, 1, thickness=20.0), random_octahedra(7, 1, thickness=4.6)
     both = Primitives(*(np.concatenate([getattr(thick, name), getattr(thin, name)]) for name in FIELDS))
     assert write_primitive_ply(tmp_path / "x.ply", both) == {"rows": 12, "clamped": 5}
@@ -105,7 +105,7 @@ def test_rows_without_volume_are_dropped_and_counted(tmp_path):
     assert len(octahedra) == 3 and report == {"rows": 4, "dropped": 1}
 
 
-def test_tetrahedra_are_linprims_layout_with_a_fourth_distance(tmp_path):
+def test_tetrahedra_use_the_layout_of_linprim_with_a_fourth_distance(tmp_path):
     before = random_tetrahedra(200, 16, thickness=1.25)
     assert write_primitive_ply(tmp_path / "x.ply", before) == {"rows": 200, "clamped": 0}
     header = read_ply_header(tmp_path / "x.ply")
@@ -167,7 +167,7 @@ def test_a_round_trip_through_3dgs_file(tmp_path):
 # --- our own file ----------------------------------------------------------------------------------------
 
 
-def test_npz_is_exact(tmp_path):
+def test_npz_round_trip_is_exact(tmp_path):
     before = random_octahedra(100, 16)
     save_primitives(tmp_path / "x.npz", before)
     after = load_primitives(tmp_path / "x.npz")
@@ -320,7 +320,7 @@ BAD_PLY = {
 
 
 @pytest.mark.parametrize("name", BAD_PLY)
-def test_a_bad_ply_is_one_sentence(tmp_path, name):
+def test_invalid_ply_is_refused_with_little_memory(tmp_path, name):
     data, sentence = BAD_PLY[name]
     (tmp_path / "x.ply").write_bytes(data)
     tracemalloc.start()
@@ -335,7 +335,7 @@ def test_a_bad_ply_is_one_sentence(tmp_path, name):
     st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), max_size=4),
     st.integers(0, len(GOOD)),
 )
-def test_no_damage_ends_in_anything_but_a_sentence(tmp_path_factory, changes, length):
+def test_damaged_ply_is_read_or_refused_with_one_sentence(tmp_path_factory, changes, length):
     path = tmp_path_factory.getbasetemp() / "damaged.ply"
     data = bytearray(GOOD)
     for position, value in changes:

@@ -1,4 +1,4 @@
-"""Primitives: vertices, faces and volumes of each kind against geometry computed another way, and the file."""
+"""Primitives: vertices, faces and volumes of each kind compared with closed forms, and the file format."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def corners_of(primitives: Primitives) -> np.ndarray:
     return mesh.vertices[mesh.faces].reshape(len(primitives), -1, 3, 3)
 
 
-def test_vertices_of_a_tetrahedron_lie_where_its_definition_says():
+def test_vertices_of_a_tetrahedron_follow_its_definition():
     primitives = some("tetrahedron")
     for row in range(len(primitives)):
         for j, b in enumerate([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]):
@@ -43,19 +43,19 @@ def test_vertices_of_a_tetrahedron_lie_where_its_definition_says():
 
 
 @pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
-def test_faces_look_outward_and_close_the_solid(kind):
+def test_faces_point_outward_and_close_the_solid(kind):
     primitives = some(kind)
     corners = corners_of(primitives)
     normal = np.cross(corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0])
     away = corners.mean(2) - primitives.center[:, None].astype(np.float64)
     assert (np.einsum("nfi,nfi->nf", normal, away) > 0).all()
-    # The vector areas of a closed surface add up to nothing.
+    # The vector areas of a closed surface sum to zero.
     assert np.abs(normal.sum(1)).max() < 1e-12 * np.abs(normal).max() * len(primitives)
     for j, face in enumerate(KINDS["tetrahedron"].faces):
         assert j not in face
 
 
-def test_a_kinds_size_gives_it_the_volume_of_an_octahedron():
+def test_size_of_a_kind_gives_the_volume_of_an_octahedron():
     def volume(kind):
         extent = np.full((1, KINDS[kind].extents), KINDS[kind].size)
         one = Primitives(np.zeros((1, 3)), [[1, 0, 0, 0]], extent, [1.0], np.zeros((1, 1, 3)), kind)
@@ -68,14 +68,14 @@ def test_a_kinds_size_gives_it_the_volume_of_an_octahedron():
 
 
 @pytest.mark.parametrize("kind", ["octahedron", "tetrahedron"])
-def test_alpha_is_the_light_taken_along_the_reference_length(kind):
+def test_alpha_is_the_absorption_along_the_reference_length(kind):
     primitives = some(kind)
     length = KINDS[kind].reference_length(primitives.extent.astype(np.float64))
     np.testing.assert_allclose(primitives.alpha, 1 - np.exp(-primitives.density * length), rtol=1e-6)
     assert (some("gaussian").alpha == some("gaussian").density).all()
 
 
-def test_a_gaussian_has_no_surface_unless_a_size_is_named():
+def test_mesh_of_gaussians_needs_a_number_of_sigmas():
     gaussians = some("gaussian", 5)
     for make in (lambda: gaussians.vertices, gaussians.triangle_mesh):
         with pytest.raises(LinprimError, match="Gaussians have no vertices"):
@@ -87,7 +87,7 @@ def test_a_gaussian_has_no_surface_unless_a_size_is_named():
     np.testing.assert_allclose(np.linalg.norm(local, axis=2), 2.0, rtol=1e-6)
 
 
-def test_octahedra_as_gaussians():
+def test_octahedra_become_gaussians_of_the_same_opacity():
     octahedra = some("octahedron")
     gaussians = octahedra.as_gaussians()
     assert gaussians.kind == "gaussian"
@@ -98,7 +98,7 @@ def test_octahedra_as_gaussians():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_file_keeps_every_bit_and_the_kind(kind, tmp_path):
+def test_npz_round_trip_keeps_every_bit_and_the_kind(kind, tmp_path):
     before = some(kind)
     save_primitives(tmp_path / "x.npz", before)
     after = load_primitives(tmp_path / "x.npz")
@@ -134,6 +134,6 @@ def test_a_file_without_a_kind_holds_octahedra(tmp_path):
         ("octahedron", {"kind": "cube"}, "of the kind 'cube', wanted one of octahedron, tetrahedron, gaussian"),
     ],
 )
-def test_what_a_kind_cannot_be_is_one_sentence(kind, change, sentence):
+def test_invalid_values_of_a_kind_are_refused(kind, change, sentence):
     with pytest.raises(LinprimError, match=sentence):
         dataclasses.replace(some(kind), **change)

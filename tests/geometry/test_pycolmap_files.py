@@ -1,4 +1,4 @@
-"""Models of pycolmap are written whole, or a full disk is told."""
+"""Models of pycolmap are written completely, or a full disk is reported."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from linprim_geo.geometry.pycolmap_files import write_model
 
 
 def model(points: int):
-    """Of two photographs that see so many points."""
+    """A model of two photographs that both see the given number of points."""
     made, rng = pycolmap.Reconstruction(), np.random.default_rng(0)
     made.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=1, model="PINHOLE", width=80, height=60, params=[70, 70, 40, 30])
@@ -30,15 +30,15 @@ def model(points: int):
     return made
 
 
-def test_a_model_comes_back(tmp_path):
+def test_model_round_trip(tmp_path):
     write_model(model(50), tmp_path)
     again = pycolmap.Reconstruction(str(tmp_path))
     assert len(again.points3D) == 50 and sorted(image.name for image in again.images.values()) == ["b.png", "näher.png"]
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
-def test_a_full_disk_is_told(share, tmp_path):
-    """A file that may not grow stands in for the disk: the points', which is the largest."""
+def test_full_disk_is_reported(share, tmp_path):
+    """A limit of the file size stands in for a full disk. It stops the largest file."""
     (tmp_path / "whole").mkdir()
     (tmp_path / "cut").mkdir()
     write_model(model(2000), tmp_path / "whole")

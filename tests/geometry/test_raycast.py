@@ -1,4 +1,4 @@
-"""Rays against meshes: compared with brute force in float64, aimed at edges and vertices, near and far."""
+"""Ray casts of meshes compared with brute force in float64, also at edges and vertices and from far away."""
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def directions_around(count, rng):
 
 
 @pytest.mark.parametrize("offset, scale", [(0.0, 1.0), (1e5, 1.0), (-3e3, 1e-3), (50.0, 1e4)])
-def test_first_hits_are_those_of_brute_force_at_any_offset_and_size(offset, scale):
+def test_first_hits_agree_with_brute_force_at_any_offset_and_scale(offset, scale):
     rng = np.random.default_rng(1)
     vertices, faces = soup(60, rng)
     origins, directions = (
@@ -63,7 +63,7 @@ def test_first_hits_are_those_of_brute_force_at_any_offset_and_size(offset, scal
     expected, face = brute_force(vertices, faces, origins, directions)
     caster = RayCaster(vertices * scale + offset, faces)
     t, found, bary = caster.cast(origins * scale + offset, directions)
-    # Rays that pass an edge within float32's reach (1e-6) may be decided either way: a handful of 1500.
+    # Rays within 1e-6 of an edge, the resolution of float32, may hit either side: a handful of 1500.
     same = found == face
     assert np.mean(same) > 0.995 and 0.2 < np.mean(face >= 0) < 0.95
     # offset / scale digits are lost in the vertices themselves before anyone computes: 2^-53 * offset.
@@ -78,7 +78,7 @@ def test_first_hits_are_those_of_brute_force_at_any_offset_and_size(offset, scal
     assert (bary >= 0).all() and (bary.sum(1) <= 1 + 1e-12).all()
 
 
-def test_no_ray_slips_through_an_edge_or_a_vertex_of_a_closed_mesh():
+def test_rays_at_edges_and_vertices_of_a_closed_mesh_hit():
     vertices, faces = sphere(0.1)
     rng = np.random.default_rng(2)
     edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
@@ -97,11 +97,11 @@ def test_no_ray_slips_through_an_edge_or_a_vertex_of_a_closed_mesh():
                 assert (face >= 0).all()
                 assert np.abs(t - expected).max() < 3e-6
                 assert caster.occluded(origin + offset, direction, expected + 1e-4).all()
-        # The test would prove nothing if Embree alone never let a ray through.
+        # Embree alone must miss some rays, or the second cast would not be tested.
         assert caster.recast > 0
 
 
-def test_a_ray_that_passes_beside_a_silhouette_is_not_caught():
+def test_rays_just_outside_a_silhouette_miss():
     vertices, faces = OCTAHEDRON
     caster = RayCaster(vertices, faces)
     weight = np.linspace(0.05, 0.95, 50)[:, None]
@@ -116,7 +116,7 @@ def test_a_ray_that_passes_beside_a_silhouette_is_not_caught():
     assert (caster.cast((x + y) * (1.0 - 1e-5) + np.array([0.0, 0.0, 4.0]), down)[1] >= 0).all()
 
 
-def test_a_camera_aimed_at_the_apex_sees_the_apex_also_if_the_mesh_is_inside_out():
+def test_depth_of_an_octahedron_is_exact_for_either_winding():
     vertices, faces = OCTAHEDRON
     camera = Camera(65, 65, 90.0, 90.0, 32.5, 32.5, look_at(np.array([0.0, 0.0, 3.0]), np.zeros(3)))
     for winding in (faces, faces[:, ::-1]):
@@ -130,7 +130,7 @@ def test_a_camera_aimed_at_the_apex_sees_the_apex_also_if_the_mesh_is_inside_out
         assert (normal[face >= 0][:, 2] > 0).all()
 
 
-def test_depth_of_a_tilted_plane_is_exact_at_pixel_centres_with_the_principal_point_off_centre():
+def test_depth_of_a_tilted_plane_is_exact_with_an_off_centre_principal_point():
     normal, distance = np.array([0.3, -0.2, 0.933]), -0.4
     normal = normal / np.linalg.norm(normal)
     side = np.cross(normal, [1.0, 0, 0])
@@ -151,7 +151,7 @@ def test_depth_of_a_tilted_plane_is_exact_at_pixel_centres_with_the_principal_po
     assert np.abs(z - depth.ravel()).max() < 1e-12 * 40
 
 
-def test_occlusion_is_that_of_brute_force_within_its_interval():
+def test_occlusion_within_an_interval_agrees_with_brute_force():
     rng = np.random.default_rng(3)
     vertices, faces = soup(40, rng)
     origins, directions = rng.uniform(-2, 2, (1200, 3)), directions_around(1200, rng) * 1.7
@@ -171,7 +171,7 @@ def test_occlusion_is_that_of_brute_force_within_its_interval():
     assert not caster.occluded(origins, directions, -1.0).any()
 
 
-def test_a_camera_very_far_away_still_measures_to_float64():
+def test_distances_of_far_rays_have_float64_precision():
     vertices, faces = sphere(0.2)
     caster = RayCaster(vertices, faces)
     rng = np.random.default_rng(4)
@@ -185,7 +185,7 @@ def test_a_camera_very_far_away_still_measures_to_float64():
     assert (np.abs(np.linalg.norm(inner, axis=1) - 1.0) < 0.02).all()
 
 
-def test_threads_do_not_change_a_bit():
+def test_depth_maps_do_not_depend_on_threads():
     vertices, faces = sphere(0.05)
     camera = Camera(230, 201, 150.0, 150.0, 115.0, 100.0, look_at(np.array([2.0, 1.0, 1.5]), np.zeros(3)))
     results = [RayCaster(vertices, faces, threads=n).render_depth(camera) for n in (1, 2, 5)]
@@ -193,7 +193,7 @@ def test_threads_do_not_change_a_bit():
         assert all(np.array_equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-def test_single_precision_casts_agree_with_the_exact_ones():
+def test_single_precision_casts_agree_with_double_precision():
     vertices, faces = sphere(0.1)
     offset = np.array([1e4, 2e4, -5e3])
     caster = RayCaster(vertices + offset, faces)
@@ -207,7 +207,7 @@ def test_single_precision_casts_agree_with_the_exact_ones():
     assert np.abs(bary[rows] - uv[rows]).max() < 1e-3
 
 
-def test_rays_without_meaning_and_degenerate_faces_hit_nothing():
+def test_invalid_rays_and_degenerate_faces_give_no_hits():
     vertices, faces = OCTAHEDRON
     faces = np.concatenate([faces, [[0, 0, 1], [2, 2, 2]]])
     caster = RayCaster(np.concatenate([vertices, [[50.0, 0, 0]]]), faces)
@@ -232,7 +232,7 @@ def test_rays_without_meaning_and_degenerate_faces_hit_nothing():
         (OCTAHEDRON[0] * 0.0, OCTAHEDRON[1], "one point"),
     ],
 )
-def test_a_mesh_that_cannot_be_used_is_named(vertices, faces, words):
+def test_invalid_meshes_are_refused(vertices, faces, words):
     with pytest.raises(LinprimError, match=words):
         RayCaster(vertices, faces)
 

@@ -1,4 +1,4 @@
-"""The part of space that --box names."""
+"""The region of space given by --box."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def around(place, distance=3.0, count=12):
     return [look_at(tuple(np.array(place) + eye), target=place, size=(40, 30), focal=35.0) for eye in eyes]
 
 
-def test_the_box_of_cameras_around_a_place_is_what_they_show_of_it():
+def test_focus_box_of_cameras_around_a_place_is_their_common_field_of_view():
     place = (5.0, -2.0, 1.0)
     box = focus_box(around(place))
     # 15 pixels from the middle to the border, at a depth of 3.
     reach = 3.0 * 15 / 35
     np.testing.assert_allclose(box, [np.subtract(place, reach), np.add(place, reach)], atol=1e-9)
-    # One that looks elsewhere does not take it far away.
+    # One outlier camera moves it little.
     other = [*around(place, count=24), look_at((9.0, 0.0, 1.0), target=(9.0, 5.0, 1.0), size=(40, 30), focal=35.0)]
     assert np.abs(focus_box(other) - box).max() < 0.3
 
 
-def test_cameras_that_look_at_no_one_place_are_refused():
+def test_cameras_without_a_common_focus_are_refused():
     outward = [look_at((0, 0, 0), target=tuple(camera.center), size=(40, 30)) for camera in around((0, 0, 0))]
     outward += [look_at(tuple(c.center), target=tuple(2 * c.center), size=(40, 30)) for c in around((0, 0, 0))]
     along = [look_at((0.1 * k, 0, 0), target=(0.1 * k, 5, 0), size=(40, 30)) for k in range(9)]
@@ -42,7 +42,7 @@ def test_cameras_that_look_at_no_one_place_are_refused():
             focus_box(cameras)
 
 
-def test_corners_are_read_and_written():
+def test_box_text_round_trip_and_invalid_text():
     assert read_box("") is None
     box = read_box("-1,0.1,2e3,1,2,3e3")
     np.testing.assert_array_equal(box, [[-1, 0.1, 2000], [1, 2, 3000]])
