@@ -1,4 +1,4 @@
-"""Photographs that stay decoded: once each, up to a limit, and not after their files have changed."""
+"""Cache of decoded photographs: each is decoded once, up to a limit, and again after its file changed."""
 
 import os
 import pickle
@@ -31,7 +31,7 @@ def picture(grey: int, side: int = 4):
     return lambda: (np.full((side, side, 3), grey, np.uint8), None)
 
 
-def test_a_photograph_is_decoded_again_only_once_its_file_has_changed(tmp_path):
+def test_photograph_is_decoded_again_only_after_its_file_changed(tmp_path):
     file, kept = tmp_path / "a.png", DecodedPhotos()
     file.write_bytes(b"first")
     os.utime(file, ns=(1, 1))
@@ -44,12 +44,12 @@ def test_a_photograph_is_decoded_again_only_once_its_file_has_changed(tmp_path):
     os.utime(file, ns=(2, 2))
     assert kept.get("a", [file], picture(2))[0].max() == 2 and kept.used == first.nbytes
     file.unlink()
-    assert kept.get("a", [file], picture(3))[0].max() == 3  # what cannot be read is the decoder's to say
+    assert kept.get("a", [file], picture(3))[0].max() == 3  # the decoder reports a missing file
     kept.clear()
     assert kept.used == 0
 
 
-def test_the_first_ones_stay_and_no_more_than_the_limit(tmp_path):
+def test_first_photographs_stay_up_to_the_limit(tmp_path):
     file, kept = tmp_path / "a.png", DecodedPhotos(limit=100)
     file.touch()
     for key, side in (("a", 4), ("b", 5), ("c", 4)):  # 48, 75 and 48 bytes
@@ -58,7 +58,7 @@ def test_the_first_ones_stay_and_no_more_than_the_limit(tmp_path):
     assert again == [1, 2, 1] and kept.used == 96
 
 
-def test_a_copy_in_another_process_begins_empty(tmp_path):
+def test_pickled_cache_is_empty(tmp_path):
     kept = DecodedPhotos(limit=100)
     kept.get("a", [tmp_path], picture(1))
     copy = pickle.loads(pickle.dumps(kept))

@@ -1,5 +1,4 @@
-"""Decoding, averaging down and undistorting pixels: closed forms, and colours that must not leak out of
-alpha."""
+"""Decoding, downscaling and undistortion of pixels compared with closed forms, with and without alpha."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ from linprim_geo.geometry.lens import Lens, undistorted
 from linprim_geo.imaging import photos
 
 
-def test_average_of_straight_colours_is_weighted_by_alpha():
+def test_box_downscale_weights_colours_by_alpha():
     rgb = np.array([[[200, 0, 0], [0, 100, 0]], [[0, 0, 50], [9, 9, 9]]], dtype=np.uint8)
     alpha = np.array([[255, 85], [0, 0]], dtype=np.uint8)
     small, small_alpha = photos.box_downscale(rgb, alpha, 2)
@@ -31,13 +30,13 @@ def test_average_of_straight_colours_is_weighted_by_alpha():
     np.testing.assert_allclose(small[0, 0] * 85.0 * 4, (rgb * alpha[..., None].astype(float)).sum((0, 1)), atol=170)
 
 
-def test_wholly_transparent_blocks_keep_a_plain_mean():
+def test_transparent_blocks_keep_their_unweighted_mean():
     rgb = np.full((2, 2, 3), 40, np.uint8)
     small, alpha = photos.box_downscale(rgb, np.zeros((2, 2), np.uint8), 2)
     assert alpha[0, 0] == 0 and (small == 40).all()
 
 
-def test_left_over_rows_and_columns_are_cropped():
+def test_box_downscale_crops_incomplete_blocks():
     rgb = np.random.default_rng(0).integers(0, 256, (7, 8, 3), dtype=np.uint8)
     small, _ = photos.box_downscale(rgb, None, 3)
     assert small.shape == (2, 2, 3)
@@ -59,7 +58,7 @@ def test_depth_of_a_plane_is_exact_at_the_new_pixel_centres(factor):
     np.testing.assert_allclose(small, plane(half), rtol=1e-6)
 
 
-def test_depth_is_not_averaged_over_an_edge():
+def test_depth_is_not_averaged_across_an_edge():
     depth = np.ones((4, 4), np.float32)
     depth[:, 2:] = 3.0
     depth[0, 0] = 0.0
@@ -68,7 +67,7 @@ def test_depth_is_not_averaged_over_an_edge():
 
 
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "RGB", "RGBA", "CMYK", "1"])
-def test_every_mode_becomes_rgb(tmp_path, mode):
+def test_every_image_mode_is_converted_to_rgb(tmp_path, mode):
     image = Image.new("RGB", (6, 4), (255, 255, 255)).convert(mode)
     suffix = "tif" if mode == "CMYK" else "png"
     image.save(tmp_path / f"a.{suffix}")
@@ -101,7 +100,7 @@ def enormous(shape, descr) -> bytes:
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the peak cannot be set back")
 @pytest.mark.parametrize("suffix", ["npz", "npy", "png", "tif"])
 @pytest.mark.parametrize("what", ["depth", "normals", "mask"])
-def test_a_file_that_unpacks_to_another_size_takes_no_memory(tmp_path, suffix, what):
+def test_file_of_another_size_is_refused_without_reading_it(tmp_path, suffix, what):
     path = tmp_path / f"a.{suffix}"
     if suffix in ("npz", "npy") and (what == "mask" or (what, suffix) == ("normals", "npz")):
         pytest.skip("masks are read from images alone, and normals not from .npz")
@@ -122,7 +121,7 @@ def test_a_file_that_unpacks_to_another_size_takes_no_memory(tmp_path, suffix, w
     assert peak_gib() < before + 0.02
 
 
-def test_a_depth_file_packed_by_a_method_that_numpy_does_not_write_is_refused(tmp_path):
+def test_npz_with_unsupported_compression_is_refused(tmp_path):
     content = io.BytesIO()
     np.save(content, np.ones((4, 6), np.float32))
     with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_LZMA) as archive:
@@ -141,7 +140,7 @@ def distorted_view(tmp_path, **options) -> View:
     return View("a", camera, tmp_path / "a.png", file_size=(60, 44), lens=BARREL, cache=tmp_path / "cache", **options)
 
 
-def test_undistorted_alpha_does_not_bleed_hidden_colours(tmp_path):
+def test_undistortion_does_not_mix_in_colours_of_transparent_pixels(tmp_path):
     pixels = np.zeros((44, 60, 4), np.uint8)
     pixels[..., :3] = (255, 0, 255)  # what a transparent background hides
     pixels[10:30, 15:45] = (10, 200, 30, 255)
@@ -151,7 +150,7 @@ def test_undistorted_alpha_does_not_bleed_hidden_colours(tmp_path):
     np.testing.assert_array_equal(np.unique(photo.rgb[photo.alpha > 8], axis=0), [[10, 200, 30]])
 
 
-def test_cache_gives_the_same_pixels_and_follows_the_content(tmp_path):
+def test_cache_returns_the_same_pixels_and_depends_on_the_content(tmp_path):
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 256, (44, 60, 3), dtype=np.uint8)).save(tmp_path / "a.png")
     view = distorted_view(tmp_path)
@@ -166,7 +165,7 @@ def test_cache_gives_the_same_pixels_and_follows_the_content(tmp_path):
     assert len(list((tmp_path / "cache").rglob("*.png"))) == 2
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(tmp_path):
+def test_cache_that_cannot_be_written_is_ignored(tmp_path):
     Image.new("RGB", (60, 44), (9, 8, 7)).save(tmp_path / "a.png")
     (tmp_path / "cache").write_text("a file where the folder should be")
     assert (distorted_view(tmp_path).load().rgb == (9, 8, 7)).all()

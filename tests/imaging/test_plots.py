@@ -1,4 +1,4 @@
-"""Plots: what is drawn stands where its numbers say, can be put into a page, and is the same every time."""
+"""Plots: positions of what is drawn, elements for a page, and reproducible files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def texts(tree):
     return [(float(each.get("x")), float(each.get("y")), each.text) for each in tree.iter("text")]
 
 
-def test_settings_in_the_folder_it_is_called_in_change_nothing(tmp_path):
+def test_matplotlibrc_in_the_working_directory_is_ignored(tmp_path):
     program = "import sys; from linprim_geo.imaging.plots import Panel, Point, frontiers; "
     program += "print(frontiers([Panel('a', [Point('b', 1.0, 1.0, 1.0, 1.0, True, True)], 'x', 'y')], 'label'))"
     plain, planted = tmp_path / "plain", tmp_path / "planted"
@@ -56,7 +56,7 @@ def panel(count=5, **changed):
     return Panel("Errors & times", points, "seconds", "error, %")
 
 
-def test_curves_go_through_their_points():
+def test_curves_pass_through_their_points():
     text = curves([("a & b", [0, 50, 100], [1.0, 10.0, 100.0]), ("held", [100], [50])], "step", "loss", log=True)
     tree = ElementTree.fromstring(text)
     assert "a & b: 100" in tree.get("aria-label") and "held: 50" in tree.get("aria-label")
@@ -71,7 +71,7 @@ def test_curves_go_through_their_points():
     assert {"a & b: 100", "held: 50", "step", "loss", "0", "20", "100"} <= set(names)
 
 
-def test_an_element_for_a_page_reaches_nothing_outside_itself():
+def test_svg_element_is_self_contained():
     for text in (curves([("x", [1, 2], [3, 4])], "<x>", "y"), frontiers([panel()], "errors over times")):
         tree = ElementTree.fromstring(text)
         assert tree.tag == "svg" and tree.get("role") == "img" and tree.get("aria-label")
@@ -79,18 +79,18 @@ def test_an_element_for_a_page_reaches_nothing_outside_itself():
         ids = [each.get("id") for each in tree.iter() if each.get("id")]
         used = {each.get("href").removeprefix("#") for each in tree.iter("use")}
         assert len(ids) == len(set(ids)) and set(ids) == used
-        # HTML ends only these where they begin.
+        # Only these elements may be self-closing in HTML.
         assert set(re.findall(r"<(\w+)[^>]*/>", text)) <= {"path", "use"}
 
 
-def test_the_same_numbers_give_the_same_bytes(tmp_path):
+def test_plots_are_reproducible_byte_for_byte(tmp_path):
     assert frontiers([panel()], "x") == frontiers([panel()], "x")
     for name in ("a.png", "b.png"):
         plots.histogram(tmp_path / name, {"one": np.linspace(0, 1, 50)}, 0.9, 0.3, "title", "mm")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
-def test_names_of_near_points_do_not_cover_each_other():
+def test_labels_of_near_points_do_not_overlap():
     tree = ElementTree.fromstring(frontiers([panel()], "errors"))
     labels = [(x, y) for x, y, text in texts(tree) if text.startswith("setting")]
     assert len(labels) == 5
@@ -101,7 +101,7 @@ def test_names_of_near_points_do_not_cover_each_other():
             assert abs(x - u) >= width or abs(y - v) >= line
 
 
-def test_the_frontier_is_a_line_in_steps_and_other_points_are_dim():
+def test_frontier_is_a_step_line_and_other_points_are_dimmed():
     points = [
         Point("a", 1, 1, 1, 4, True, False),
         Point("b", 2, 2, 2, 6, False, True),
@@ -115,7 +115,7 @@ def test_the_frontier_is_a_line_in_steps_and_other_points_are_dim():
     assert len(dots) == 1 and line[0, 0] < float(dots[0].get("x")) < line[-2, 0]
 
 
-def test_a_file_has_a_ground_and_a_style_of_its_own():
+def test_svg_file_has_its_own_background_and_style():
     text = frontiers([panel(), panel()], "two", "svg { --blue: #ffffff; }")
     tree = ElementTree.fromstring(text)
     space = "{http://www.w3.org/2000/svg}"
@@ -124,8 +124,8 @@ def test_a_file_has_a_ground_and_a_style_of_its_own():
     assert [each.text for each in tree.iter(f"{space}text")].count("Errors & times") == 2
 
 
-def test_rates_and_distances_are_where_they_should_be(tmp_path):
-    """A rate of a half throughout is a line in the middle of the frame, and a single distance one bar."""
+def test_rates_and_histogram_are_drawn_at_their_values(tmp_path):
+    """A constant rate of one half is a line in the middle of the frame, and a single distance is one bar."""
     thresholds = np.logspace(-2, 1, 50)
     plots.rates(tmp_path / "rates.png", thresholds, {"precision": np.full(50, 0.5)}, 1.0, "title", "mm")
     plots.histogram(tmp_path / "bars.png", {"one": np.full(20, 0.45)}, 0.8, 0.3, "title", "mm")
