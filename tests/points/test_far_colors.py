@@ -1,4 +1,4 @@
-"""What photographs show at infinity: a panorama is recognised, noise and exposures are not taken for one."""
+"""Share of what photographs show at infinity, for a panorama, edges, noise and different exposures."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ def scene_of(folder, pictures, of_cameras=None):
     return load_scene(folder)
 
 
-def test_a_panorama_is_explained_by_half_of_the_photographs(tmp_path):
+def test_panorama_is_recognised(tmp_path):
     scene = scene_of(tmp_path, [panorama(camera.world_rays()) for camera in cameras()])
     assert far_share(scene, None) > 0.5
 
 
-def test_edges_along_the_motion_agree_at_any_distance(tmp_path):
-    """A near wall with level stripes, passed by sideways: what is at infinity would look the same."""
+def test_edges_along_the_motion_are_not_taken_for_a_panorama(tmp_path):
+    """Cameras move along a near wall with horizontal stripes, which would look the same at infinity."""
     passing = [look_at((x, -3.0, 0.0), (x, 0.0, 0.0), size=SIZE, focal=FOCAL) for x in np.linspace(-1, 1, VIEWS)]
     height = passing[0].world_rays()[..., 2]
     picture = np.repeat((120 + 60 * np.sin(25 * height))[..., None], 3, -1)
     assert far_share(scene_of(tmp_path, [picture] * VIEWS, passing), None) < OPEN_SHARE
 
 
-def test_noise_agrees_with_itself_alone(tmp_path):
-    """Every photograph has a texture of its own, of which nobody else shows anything."""
+def test_unrelated_textures_are_not_taken_for_a_panorama(tmp_path):
+    """Every photograph shows a texture that no other photograph shows."""
     rng = np.random.default_rng(0)
     pictures = [panorama(camera.world_rays() + rng.uniform(-9, 9, 3)) for camera in cameras()]
     assert far_share(scene_of(tmp_path, pictures), None) < OPEN_SHARE
 
 
-def test_plain_photographs_tell_nothing(tmp_path):
+def test_uniform_photographs_have_no_far_share(tmp_path):
     scene = scene_of(tmp_path, [np.full((SIZE[1], SIZE[0], 3), 130.0) for _ in cameras()])
     assert far_share(scene, None) == 0
 
 
-def test_exposures_are_made_alike(tmp_path):
+def test_known_gains_increase_the_far_share(tmp_path):
     gains = np.exp(np.random.default_rng(1).uniform(-0.4, 0.4, (VIEWS, 1)))
     scene = scene_of(tmp_path, [gain * panorama(c.world_rays()) for gain, c in zip(gains, cameras(), strict=True)])
     trained = [int(view.name.split("/")[-1].split(".")[0]) for view in scene.train]

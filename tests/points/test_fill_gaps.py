@@ -1,5 +1,4 @@
-"""Points where features find none: a room whose walls are bare but for patches, backgrounds, and clouds that cannot be
-filled."""
+"""Points added where features give none: a room with untextured walls, masks, backdrops and degenerate clouds."""
 
 from __future__ import annotations
 
@@ -95,13 +94,13 @@ def on_box(xyz):
     return ((xyz > BOX_LOW - 0.1) & (xyz < BOX_HIGH + 0.1)).all(1)
 
 
-def test_gaps_between_points_are_filled_on_the_surface(room):
+def test_new_points_lie_on_surfaces_and_fill_gaps(room):
     given = len(room.points.xyz)
     cloud = fill_gaps(room, seed=0)
     np.testing.assert_array_equal(cloud.xyz[:given], room.points.xyz)
     new = cloud.xyz[given:]
     assert len(new) > given / 2 and cloud.rgb.shape == cloud.xyz.shape and cloud.rgb.dtype == np.uint8
-    behind = (new[:, 1] > 2.07) | (new[:, 2] < -1.57)  # what nothing tells of lies beyond the room, by 2 % and more
+    behind = (new[:, 1] > 2.07) | (new[:, 2] < -1.57)  # points without evidence lie beyond the room, by 2 % and more
     distance = surface_distance(new[~behind]) / 3.5  # of the typical depth
     assert np.median(distance) < 0.003 and (distance < 0.02).mean() > 0.9 and behind.mean() < 0.15
     # The bare plates' middles get points: there is one within a quarter of a plate.
@@ -110,7 +109,7 @@ def test_gaps_between_points_are_filled_on_the_surface(room):
     assert (np.linalg.norm(cloud.xyz[None] - middles[:, None], axis=2).min(1) < 0.2).mean() > 0.9
 
 
-def test_an_object_without_features_is_found_by_its_colours(room):
+def test_object_without_features_gets_points(room):
     assert on_box(room.points.xyz).sum() <= 60  # floor points at its foot
     given = len(room.points.xyz)
     new = fill_gaps(room, seed=0)
@@ -120,9 +119,9 @@ def test_an_object_without_features_is_found_by_its_colours(room):
     assert green.sum() >= 25 and (~green).sum() <= 4
 
 
-def test_what_nothing_tells_of_lies_behind_all_that_is_known(room):
-    """In the middle of the room it would be fog between the cameras. At the depth of the nearest points 0.021 of the
-    new points were there."""
+def test_few_new_points_lie_in_free_space(room):
+    """Points without evidence of their depth are placed behind the known surfaces, not between the cameras. At the
+    depth of the nearest points, a share of 0.021 of the new points was in free space."""
     given = len(room.points.xyz)
     new = fill_gaps(room, seed=0).xyz[given:]
     free = surface_distance(new) > 0.02 * 3.5
@@ -130,7 +129,7 @@ def test_what_nothing_tells_of_lies_behind_all_that_is_known(room):
     assert (free & within).mean() < 0.015
 
 
-def test_two_calls_give_the_same_points_and_another_seed_others(room):
+def test_points_repeat_for_one_seed_and_differ_for_another(room):
     first, again, other = (fill_gaps(room, seed=seed).xyz for seed in (3, 3, 4))
     assert first.tobytes() == again.tobytes()
     assert first.shape != other.shape or (first != other).any()
@@ -145,12 +144,12 @@ def full_cloud(room):
     return with_cloud(room, np.concatenate(dense))
 
 
-def test_where_cells_are_full_nothing_is_added(room):
+def test_dense_cloud_gets_hardly_any_points(room):
     full = full_cloud(room)
     assert len(fill_gaps(full, seed=0).xyz) <= 1.01 * len(full.points.xyz)
 
 
-def test_masked_background_gets_no_points(room, tmp_path):
+def test_masked_pixels_get_no_points(room, tmp_path):
     # The same photographs with everything but the wall masked out: wall points alone may be added.
     paths = []
     for i, camera in enumerate(cameras()):
@@ -168,7 +167,7 @@ def test_masked_background_gets_no_points(room, tmp_path):
     np.testing.assert_allclose(new, np.broadcast_to(COLORS["wall"], new.shape), atol=1)
 
 
-def test_a_plain_backdrop_gets_no_points(room):
+def test_pixels_of_the_backdrop_colour_get_no_points(room):
     given = len(room.points.xyz)
     backdrop = np.array(COLORS["wall"]) / 255
     with_it = fill_gaps(room, seed=0).rgb[given:].astype(int)
@@ -177,7 +176,7 @@ def test_a_plain_backdrop_gets_no_points(room):
     assert like[0].sum() > 100 and like[1].sum() == 0 and len(without) > 100
 
 
-def test_points_that_other_views_see_through_are_dropped(room):
+def test_points_in_front_of_surfaces_of_other_views_are_dropped(room):
     full = full_cloud(room)
     views = [_Gaps(look, full.points.xyz) for look in evenly_spread_views(room.train, 100)]
     wall = np.array([[0.2, 2.0, 0.4], [-0.7, 2.0, 0.2], [0.9, 2.0, 0.3]])
@@ -186,7 +185,7 @@ def test_points_that_other_views_see_through_are_dropped(room):
     np.testing.assert_array_equal(_not_in_free_space(floating, views, 0), False)
 
 
-def test_patches_agree_at_the_true_depth(room):
+def test_patch_difference_is_smallest_at_the_true_depth(room):
     views = [_Gaps(look, room.points.xyz) for look in evenly_spread_views(room.train, 100)]
     index = 4
     view, depth = views[index], cast(cameras()[index])[0]
@@ -211,13 +210,13 @@ def test_patches_agree_at_the_true_depth(room):
     ],
     ids=["few", "line", "one place", "behind"],
 )
-def test_clouds_that_span_nothing_are_left_alone_or_filled_finitely(room, xyz):
+def test_degenerate_clouds_keep_their_points_and_stay_finite(room, xyz):
     cloud = fill_gaps(with_cloud(room, xyz), seed=0)
     np.testing.assert_array_equal(cloud.xyz[: len(xyz)], xyz)
     assert np.isfinite(cloud.xyz).all() and len(cloud.rgb) == len(cloud.xyz)
 
 
-def test_points_of_a_plane_lie_flat_and_those_of_a_volume_do_not():
+def test_local_planes_are_flat_for_a_plane_and_round_for_a_volume():
     rng = np.random.default_rng(1)
     normal = np.array([1.0, 2.0, -2.0]) / 3
     plane = rng.uniform(-1, 1, (400, 3))

@@ -1,4 +1,4 @@
-"""The frame of training and points to start from, on cameras and silhouettes whose answer is known."""
+"""Normalisation of scenes and initial points, for cameras and silhouettes with a known solution."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ def distances(scene, similarity):
     return np.array([np.linalg.norm(view.camera.transformed(similarity).center) for view in scene.train])
 
 
-def test_cameras_round_an_object_end_up_at_distance_three_from_the_origin():
+def test_normalised_cameras_around_an_object_have_the_given_median_distance():
     scene = scene_of(moved(ring(9)))
     similarity = scene_normalization(scene)
     np.testing.assert_allclose(similarity.offset, PLACE, atol=1e-9)
     np.testing.assert_allclose(np.median(distances(scene, similarity)), CAMERA_DISTANCE)
 
 
-def test_points_decide_where_there_are_any():
+def test_points_determine_the_normalisation_if_given():
     # the object is not where the axes meet, but a quarter of the way towards it
     cameras = [look_at(c, (0, 0, 0)) for c in np.array([[4.0, 0.2 * i, 0.1 * i] for i in range(-4, 5)])]
     xyz = np.random.default_rng(0).normal(0, 0.1, (500, 3)) + [3.0, 0, 0]
@@ -61,20 +61,20 @@ def test_points_decide_where_there_are_any():
     np.testing.assert_allclose(again.offset, similarity.offset, atol=0.02)
 
 
-def test_points_behind_every_camera_say_nothing():
+def test_points_behind_every_camera_are_ignored():
     cameras = [look_at((4.0, 0.3 * i, 0.2 * i)) for i in range(-4, 5)]
     similarity = scene_normalization(scene_of(cameras, np.full((50, 3), 30.0)))
     np.testing.assert_allclose(similarity.offset, [0, 0, 0], atol=1e-9)
 
 
-def test_a_few_cameras_that_look_elsewhere_do_not_move_the_focus():
+def test_focus_is_robust_to_outlier_cameras():
     cameras = ring(20)
     cameras[3] = look_at(cameras[3].center, (3.0, 9.0, 4.0))
     cameras[11] = look_at(cameras[11].center, (-7.0, 1.0, 6.0))
     np.testing.assert_allclose(scene_normalization(scene_of(cameras)).offset, [0, 0, 0], atol=1e-6)
 
 
-def test_cameras_that_look_outward_are_centred_themselves():
+def test_outward_cameras_are_centred_at_their_median():
     inside_out = [look_at(PLACE + c.center, PLACE + 2 * c.center) for c in ring(12, radius=1.0)]
     scene = scene_of(inside_out)
     centers = np.array([camera.center for camera in inside_out])
@@ -138,7 +138,7 @@ def test_visual_hull_of_a_ball_is_the_ball(tmp_path):
     assert (visual_hull_points(scene, 5000, seed=2).xyz != cloud.xyz).any()
 
 
-def test_colors_come_from_the_foreground_alone(tmp_path):
+def test_colors_come_from_the_foreground_only(tmp_path):
     # The pixels beside the ball hide blue: a point there has no colour of its own and gets the ball's.
     scene = silhouettes(tmp_path, sphere_ring(8))
     beside = PLACE + np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0.1, 0.1, 0.1]])
@@ -146,7 +146,7 @@ def test_colors_come_from_the_foreground_alone(tmp_path):
     np.testing.assert_allclose(colors, np.broadcast_to([200, 60, 20], (4, 3)), atol=1)
 
 
-def test_visual_hull_where_images_cut_the_object_off(tmp_path):
+def test_visual_hull_of_an_object_cut_off_by_images(tmp_path):
     # so close that the ball fills the image: nothing is known outside, and nothing inside of it is lost
     near = [look_at(PLACE + 0.45 * (c.center - PLACE), PLACE, size=(96, 80), focal=150.0) for c in sphere_ring()]
     scene = silhouettes(tmp_path, sphere_ring()[:12] + near[12:])
@@ -169,7 +169,7 @@ def test_a_scene_without_masks_has_no_visual_hull(tmp_path):
         visual_hull_points(scene_of(ring(5)), 10, 0)
 
 
-def test_frusta_points_are_seen_by_three_cameras_and_have_their_colours(tmp_path):
+def test_frusta_points_are_seen_by_three_cameras_and_take_their_colours(tmp_path):
     cameras = moved(ring(10, size=(32, 24)))
     paths = [f"{i}.png" for i in range(10)]
     for path in paths:
@@ -187,7 +187,7 @@ def test_frusta_points_are_seen_by_three_cameras_and_have_their_colours(tmp_path
     np.testing.assert_array_equal(frusta_points(scene, 2000, seed=0).xyz, cloud.xyz)
 
 
-def test_frusta_points_of_two_cameras_that_share_nothing(tmp_path):
+def test_frusta_points_of_two_cameras_without_overlap(tmp_path):
     poses = [look_at((1, 0, 0), (5, 0, 0)), look_at((-1, 0, 0), (-5, 0, 0))]
     frames = []
     for i, camera in enumerate(poses):

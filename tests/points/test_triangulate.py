@@ -1,4 +1,4 @@
-"""Triangulated points against the walls they lie on: a textured room, cameras known exactly, nothing else."""
+"""Triangulated points compared with the walls of a textured room, for exact cameras."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_images_without_texture_give_no_points(tmp_path):
         triangulate_points(load_scene(tmp_path), cache=tmp_path / "cache")
 
 
-def test_pairs_are_neighbours_that_look_the_same_way(room):
+def test_matching_pairs_are_neighbours_with_similar_directions(room):
     cameras = [view.camera for view in load_scene(room).train]
     pairs = matching_pairs(cameras, partners=2)
     assert all(i < j for i, j in pairs) and len(set(pairs)) == len(pairs)
@@ -89,13 +89,13 @@ def test_pairs_are_neighbours_that_look_the_same_way(room):
     assert matching_pairs([cameras[0], away]) == []
 
 
-def test_points_without_company_are_dropped():
+def test_isolated_points_are_dropped():
     rng = np.random.default_rng(0)
     wall = np.concatenate([rng.uniform(0, 4, (500, 2)), np.zeros((500, 1))], axis=1)
     stray = np.array([[2.0, 2.0, 30.0], [-9.0, 0.0, 1.0], [-9.0, 0.5, 1.2]])
     keep = not_isolated(np.concatenate([wall, stray]), np.full(503, 3.0))
     assert keep[:500].mean() > 0.98 and not keep[500:].any()
-    # a far wall is as good as a near one if its points are as far apart in the camera's eye
+    # A far wall is kept like a near one if the angular spacing of its points is the same.
     far = wall * 20 + [0, 0, 60]
     keep = not_isolated(np.concatenate([wall, far]), np.r_[np.full(500, 3.0), np.full(500, 60.0)])
     assert keep.mean() > 0.98
@@ -128,7 +128,7 @@ def test_unreliable_points_are_dropped(room):
     assert reliable_points(cameras, points(near_wall))[-1]
 
 
-def test_distance_from_epipolar_geometry_is_in_pixels(room):
+def test_sampson_distance_is_in_pixels(room):
     first, second = (load_scene(room).train[i].camera for i in (0, 4))
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3)) + [1.5, 2.0, 0.2]
     one, two = first.project(points)[0], second.project(points)[0]
@@ -143,7 +143,7 @@ def test_distance_from_epipolar_geometry_is_in_pixels(room):
     np.testing.assert_allclose(sampson_px(first, second, one, two + 5 * across), 5 / np.sqrt(2), rtol=0.25)
 
 
-def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
+def test_matches_off_the_epipolar_lines_are_dropped(room, tmp_path):
     import pycolmap
 
     views = load_scene(room).train
@@ -163,7 +163,7 @@ def test_matches_that_the_poses_forbid_are_dropped(room, tmp_path):
     assert kept[:, 0].tolist() == kept[:, 1].tolist() == [0, 1, 2, 3]
 
 
-def test_a_full_disk_is_no_reason_to_start_from_random_points(room, monkeypatch):
+def test_full_disk_is_raised_instead_of_using_random_points(room, monkeypatch):
     scene, options = load_scene(room), TrainOptions(max_primitives=100)
 
     def failing(error):
@@ -176,7 +176,7 @@ def test_a_full_disk_is_no_reason_to_start_from_random_points(room, monkeypatch)
         with_points(scene, options, lambda _: None)
 
 
-def test_a_full_disk_for_keypoints_is_told(room, monkeypatch, tmp_path):
+def test_full_disk_while_writing_keypoints_is_reported(room, monkeypatch, tmp_path):
     monkeypatch.setattr("linprim_geo.base.files._disk_is_full", lambda _: True)
     monkeypatch.setattr(
         "linprim_geo.geometry.feature_points._match",

@@ -1,4 +1,4 @@
-"""Which views are matched with which."""
+"""Choice of source views."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from helpers.captures import look_at
 from linprim_geo.points import view_pairs
 
 
-def test_every_point_gets_its_views_where_more_may_be_taken():
-    """Two walls, a few cameras before each of them, and one in the middle that sees half of both."""
+def test_more_source_views_cover_every_point():
+    """Two walls with five cameras in front of each, and one camera in the middle that sees half of both."""
     rng = np.random.default_rng(0)
     left, right = (rng.uniform([x - 1, 3.9, -1], [x + 1, 4.1, 1], (400, 3)) for x in (-1.2, 1.2))
     cameras = [look_at((0.0, 0.0, 0.0), (0.0, 4.0, 0.0), size=(60, 40))]
@@ -27,7 +27,7 @@ def test_every_point_gets_its_views_where_more_may_be_taken():
     assert (times >= 3).mean() > 0.9 > (seen[few][:, own].sum(0) >= 3).mean()
 
 
-def test_no_more_views_than_show_something():
+def test_views_without_overlap_or_baseline_are_not_chosen():
     points = np.random.default_rng(0).uniform([-0.3, 1.9, -0.3], [0.3, 2.1, 0.3], (300, 3))
     cameras = [look_at((x, 0.0, 0.0), (x, 2.0, 0.0), size=(40, 30)) for x in (0.0, 0.3, -0.3, 0.02)]
     cameras.append(look_at((0.0, 0.0, 0.0), (0.0, -2.0, 0.0), size=(40, 30)))
@@ -36,8 +36,8 @@ def test_no_more_views_than_show_something():
     assert view_pairs.source_views(cameras[:1], points) == [[]]
 
 
-def test_a_point_behind_a_surface_gets_views_that_see_past_it():
-    """A wall with a board before it, which hides more of the wall from the cameras on one side."""
+def test_known_depths_select_views_that_see_past_an_occluder():
+    """A wall with a board in front, which hides more of the wall from the cameras on one side."""
     rng = np.random.default_rng(0)
     wall = rng.uniform([-1.5, 4, -1], [1.5, 4, 1], (2000, 3))
     cameras = [look_at((0.0, 0.0, 0.0), (0.0, 4.0, 0.0), size=(60, 40))]
@@ -51,15 +51,15 @@ def test_a_point_behind_a_surface_gets_views_that_see_past_it():
 
     depths = [depth(camera) for camera in cameras]
     blind, told = (view_pairs.source_views(cameras, wall, 8, known)[0] for known in (None, depths))
-    # What the first camera sees of the wall right of its middle only the last three see, too.
+    # The part of the wall that the first camera sees right of its middle is seen by the last three only.
     assert sorted(blind) == [1, 2, 3, 4] and sorted(told[:3]) == [5, 6, 7]
-    # Where a view has no depth nothing hides a point.
+    # A view without depth hides no point.
     assert view_pairs.source_views(cameras, wall, 8, [0 * own for own in depths])[0] == blind
 
 
-def test_few_photographs_are_compared_under_larger_angles():
-    """Cameras on a circle around what they look at: where 30 degrees hold too few, up to 60 do, and no more than it
-    takes to confirm a depth."""
+def test_angles_of_source_views_grow_if_there_are_few():
+    """Cameras on a circle around the points. If too few lie within 30 degrees, views up to 60 degrees are added until a
+    depth can be confirmed."""
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (300, 3))
 
     def compared(degrees: list[float]) -> list[int]:
