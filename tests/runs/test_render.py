@@ -1,4 +1,4 @@
-"""Rendering a run to files: names, formats, and values against a surface that is known exactly."""
+"""Rendering of a run to files: names, formats, and values compared with an exact surface."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def truth(solid):
     return rows
 
 
-def test_files_of_every_view(tiny_run, tmp_path):
+def test_render_writes_all_files_of_every_view(tiny_run, tmp_path):
     report = render_run(tiny_run, output=tmp_path / "r", quiet=True)
     assert report == {"output": str(tmp_path / "r"), "views": 3, "files": 33}
     written = sorted(str(path.relative_to(tmp_path / "r")) for path in (tmp_path / "r").rglob("*.*"))
@@ -53,7 +53,7 @@ def test_files_of_every_view(tiny_run, tmp_path):
         assert image.size == (48, 48) and image.mode == "RGB"
 
 
-def test_files_hold_what_the_run_renders(tiny_run, tmp_path):
+def test_files_contain_the_rendered_images(tiny_run, tmp_path):
     render_run(tiny_run, split="train", output=tmp_path, quiet=True)
     run = Run.open(tiny_run)
     views = run.scene().train
@@ -65,12 +65,12 @@ def test_files_hold_what_the_run_renders(tiny_run, tmp_path):
     assert np.abs(saved.transpose(2, 0, 1) / 255.0 - np.clip(images["rgb"], 0, 1)).max() <= 0.5 / 255 + 1e-6
 
 
-def test_all_splits_go_to_their_own_folders_in_the_run(run_copy):
+def test_every_split_has_its_own_folder_in_the_run(run_copy):
     assert render_run(run_copy, split="all", quiet=True)["views"] == 15
     assert sorted(path.name for path in (run_copy / "renders").iterdir()) == ["test", "train"]
 
 
-def test_depths_are_those_of_the_surface(truth):
+def test_depths_agree_with_the_surface(truth):
     # The medians lie ln 2 / density behind the surface, along the ray; float32 depths near 4 are good to 1e-6.
     behind = math.log(2) / DENSITY * 2
     for _, images, depth, _, inner in truth:
@@ -85,13 +85,13 @@ def test_depths_are_those_of_the_surface(truth):
         assert (images["normal"][outside] == 0).all()
 
 
-def test_normals_are_those_of_the_surface_in_the_world(truth):
+def test_normals_agree_with_the_surface_in_world_axes(truth):
     for _, images, _, normal, inner in truth:
         cosine = np.einsum("nc,nc->n", images["normal"][inner], normal[inner])
         assert cosine.min() > 1 - 1e-5
 
 
-def test_colour_is_that_of_the_primitive_over_the_background(truth):
+def test_colour_agrees_with_the_photograph(truth):
     for view, images, depth, _, inner in truth:
         color = images["rgb"][:, inner]
         assert np.ptp(color) < 1e-3
@@ -101,7 +101,7 @@ def test_colour_is_that_of_the_primitive_over_the_background(truth):
         assert np.allclose(images["rgb"][:, ~np.isfinite(depth)].min(), 1, atol=1e-3) or color.mean() < 1
 
 
-def test_the_median_is_taken_at_the_level_that_is_asked_for(tmp_path):
+def test_median_depth_is_taken_at_the_given_level(tmp_path):
     density = 2.0
     run = Run.open(octahedron_run(tmp_path, density=density, views=4))
     view = run.scene().test[0]
@@ -109,7 +109,7 @@ def test_the_median_is_taken_at_the_level_that_is_asked_for(tmp_path):
     levels = (0.8, 0.6)
     rendered = [next(run.render_views([view], level=level))[1] for level in levels]
     depth = rendered[0]["depth_first"]
-    # Where even the deeper level is reached, with a margin for pixels that just do.
+    # Pixels where even the deeper level is reached, with a margin.
     reached = rendered[0]["opacity"] > 1 - levels[1] + 0.02
     assert reached.sum() > 100
     for level, images in zip(levels, rendered, strict=True):
@@ -119,7 +119,7 @@ def test_the_median_is_taken_at_the_level_that_is_asked_for(tmp_path):
     assert (rendered[0]["depth_median"][never] == 0).all() and never.any()
 
 
-def test_the_octahedron_is_where_it_was_put(solid):
+def test_exported_octahedron_agrees_with_the_reference_mesh(solid):
     saved, reference = Run.open(solid).primitives(), load_mesh(solid.parent / "scene" / "reference.ply")
     assert np.abs(saved.center - np.array(CENTER)).max() < 1e-5
     assert np.abs(saved.extent - np.array(EXTENT)).max() < 1e-5
@@ -127,7 +127,7 @@ def test_the_octahedron_is_where_it_was_put(solid):
     assert np.abs(shell.max(0) - reference.vertices.max(0)).max() < 1e-5
 
 
-def test_preview_of_depths():
+def test_depth_preview_shows_near_bright_and_missing_black():
     depth = np.array([[0.0, 1.0], [2.0, np.inf]])
     picture = depth_preview(depth)
     assert picture.shape == (2, 2, 3) and picture.dtype == np.uint8

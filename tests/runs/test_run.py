@@ -1,4 +1,4 @@
-"""A run's folder: what is written comes back, damage is one sentence, and the data set's frame is kept."""
+"""Folder of a run: round trips, damaged files, and export in the frame of the data set."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def some_octahedra(count=5):
     return Primitives(rng.normal(size=(count, 3)), rotation, extent, density, rng.normal(size=(count, 4, 3)))
 
 
-def test_a_created_run_opens_as_it_was(tiny_scene, tmp_path):
+def test_created_run_round_trip(tiny_scene, tmp_path):
     scene, similarity = load_scene(tiny_scene), Similarity(0.25, (1.0, 2.0, -3.5))
     scene_options, options = SceneOptions(downscale=2), TrainOptions(iterations=3, background="1,0,0.5")
     made = Run.create(tmp_path / "run", scene, tiny_scene, scene_options, options, similarity)
@@ -75,7 +75,7 @@ def test_every_export_holds_the_same_primitives(tmp_path):
     assert exported.alpha.max() < 1 and np.allclose(ply.extent, exported.extent, rtol=1e-6)
 
 
-def test_lengths_and_densities_change_with_the_frame_and_opacity_does_not():
+def test_change_of_frame_scales_lengths_and_densities_and_keeps_opacity():
     octahedra = some_octahedra()
     moved = to_data_set(octahedra, Similarity(0.01, (1.0, 2.0, 3.0)))
     assert np.allclose(moved.extent, octahedra.extent * 100, rtol=1e-6)
@@ -98,7 +98,7 @@ def test_the_opacity_of_gaussians_is_the_same_in_every_frame(tmp_path):
     assert read_primitive_ply(tmp_path / "scene.ply")[0].kind == "gaussian"
 
 
-def test_options_of_another_version_are_left_out(run_copy):
+def test_unknown_options_in_the_configuration_are_ignored(run_copy):
     edit(run_copy / "config.json", lambda c: c["train_options"].update(warp_drive=True))
     assert Run.open(run_copy).train_options.iterations == 400
 
@@ -141,7 +141,7 @@ DAMAGE = {
 
 
 @pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_run_is_one_sentence(damage, run_copy):
+def test_damaged_run_is_refused_with_one_sentence(damage, run_copy):
     DAMAGE[damage](run_copy)
     with pytest.raises(LinprimError) as caught:
         run = Run.open(run_copy)
@@ -149,7 +149,7 @@ def test_a_damaged_run_is_one_sentence(damage, run_copy):
     assert str(run_copy) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_scene_that_was_moved_away_is_named(run_copy, tmp_path):
+def test_missing_scene_folder_is_reported(run_copy, tmp_path):
     edit(run_copy / "config.json", lambda c: c.update(scene=str(tmp_path / "gone")))
     run = Run.open(run_copy)
     assert len(run.primitives()) == 300
@@ -157,15 +157,15 @@ def test_a_scene_that_was_moved_away_is_named(run_copy, tmp_path):
         run.scene()
 
 
-def test_a_folder_that_is_no_run_is_one_sentence(tmp_path):
+def test_folder_without_a_run_is_refused(tmp_path):
     for path, sentence in ((tmp_path, "config.json is missing"), (tmp_path / "missing", "missing: no such folder")):
         with pytest.raises(LinprimError, match=sentence):
             Run.open(path)
 
 
 @pytest.mark.parametrize("kind", ["octahedron", "gaussian"])
-def test_surfaces_begin_at_the_near_plane_of_training(tiny_scene, tmp_path, kind):
-    """One primitive lies before the near plane of Gaussians, the other at three times the distance behind it."""
+def test_surface_depths_start_at_the_near_plane_of_training(tiny_scene, tmp_path, kind):
+    """One primitive lies in front of the near plane of Gaussians, the other behind it at three times its distance."""
     scene, options = load_scene(tiny_scene), TrainOptions(primitive=kind)
     run = Run.create(tmp_path / "run", scene, tiny_scene, SceneOptions(), options, Similarity())
     camera = scene.train[0].camera
@@ -181,7 +181,7 @@ def test_surfaces_begin_at_the_near_plane_of_training(tiny_scene, tmp_path, kind
     assert images["depth_median"][images["depth_median"] > 0].min() == pytest.approx(nearest, abs=0.03)
 
 
-def test_the_primitives_are_read_once_and_anew_after_they_were_saved(tiny_run, tmp_path, monkeypatch):
+def test_primitives_are_read_once_and_again_after_a_save(tiny_run, tmp_path, monkeypatch):
     opened, read = Run.open(shutil.copytree(tiny_run, tmp_path / "run")), []
     monkeypatch.setattr(runs, "load_primitives", lambda path: read.append(path) or load_primitives(path))
     first = opened.training_primitives()
