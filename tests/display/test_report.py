@@ -1,4 +1,4 @@
-"""The report of a run: all its parts, what it says where one is missing, and that it needs nothing but itself."""
+"""The report of a run: its sections, messages about missing parts, and no external resources."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ XHTML_VOID = {"meta", "img", "input"}
 
 @pytest.fixture(scope="module")
 def meshed(tiny_run, tiny_scene, tmp_path_factory) -> Path:
-    """A run with a name that HTML has to escape, meshed, and scored against the exact surface."""
+    """A run whose name needs escaping in HTML, with a mesh and its scores against the exact surface."""
     run = Path(shutil.copytree(tiny_run, tmp_path_factory.mktemp("odd") / """a <b>&'"run""", ignore=MESHES))
     stats = extract_mesh(run, options=ExtractOptions(level=0.7, smooth=2), quiet=True)
     eval_mesh_files(stats["mesh"], tiny_scene / "reference.ply", run=run, samples=5000)
@@ -48,7 +48,7 @@ def meshed(tiny_run, tiny_scene, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def made(meshed) -> tuple[dict, str, ElementTree.Element]:
-    """What `report_run` returned, its page as text, and as a tree, which well-formed XML alone gives."""
+    """The result of `report_run` and its page, as text and as a tree. Only well-formed XML can be parsed."""
     before = {file: file.stat().st_mtime_ns for file in meshed.rglob("*") if file.is_file()}
     result = report_run(meshed)
     after = {
@@ -67,7 +67,7 @@ def array(text: str, kind: str, columns: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), kind).reshape(-1, columns)
 
 
-def test_all_parts_are_there(made):
+def test_report_has_all_sections(made):
     result, _, tree = made
     assert result["views"] == 3 and result["meshes"] == ["tsdf"] and result["missing"] == []
     assert 0 < result["bytes"] < 15 * 2**20
@@ -84,7 +84,7 @@ def test_all_parts_are_there(made):
     assert "v" in "".join(sections["repeat"].itertext()) and "boundary" in "".join(sections["mesh"].itertext())
 
 
-def test_nothing_is_fetched_and_names_are_escaped(made, meshed):
+def test_report_is_self_contained_and_escapes_names(made, meshed):
     _, text, tree = made
     assert not re.search(r"https?:", text) and "url(" not in text and "@import" not in text
     for element in tree.iter():
@@ -95,12 +95,12 @@ def test_nothing_is_fetched_and_names_are_escaped(made, meshed):
     assert "default-src 'none'" in policy
     assert tree.find("body/header/h1").text.endswith(meshed.name)  # not markup, but text
     assert meshed.name not in text and str(escape(meshed.name)) in text
-    # The same elements to a reader of HTML, which knows which of them have no end.
+    # Only elements that are void in HTML may be self-closing, so that HTML and XML give the same tree.
     for tag in set(re.findall(r"<(\w+)[^>]*/>", text.split("<script")[0])):
         assert tag in XHTML_VOID | {"path", "use"}, tag
 
 
-def test_pictures_are_those_of_the_views(made, meshed):
+def test_pictures_agree_with_photographs_and_renderings(made, meshed):
     _, _, tree = made
     run = Run.open(meshed)
     by_name = {view.name: view for view in run.scene().test}
@@ -135,7 +135,7 @@ def test_pictures_are_those_of_the_views(made, meshed):
     assert unit == "dB" and abs(float(shown) - np.mean(shown_psnr)) < 0.01 + 1e-9
 
 
-def test_the_page_opens_with_the_picture_of_the_mesh(made, meshed):
+def test_first_section_shows_the_picture_of_the_mesh(made, meshed):
     _, _, tree = made
     (figure,) = (each for each in tree.iter("figure") if each.get("class") == "wide")
     assert figure in list(next(tree.iter("section")))
@@ -147,7 +147,7 @@ def test_the_page_opens_with_the_picture_of_the_mesh(made, meshed):
 
 
 @pytest.mark.parametrize("kept", [0, 200])
-def test_without_the_picture_of_the_mesh_the_page_says_so(meshed, kept, tmp_path):
+def test_missing_or_damaged_picture_of_the_mesh_is_reported(meshed, kept, tmp_path):
     file = meshed / "mesh" / "tsdf" / "mesh_shaded.png"
     whole = file.read_bytes()
     try:
@@ -161,7 +161,7 @@ def test_without_the_picture_of_the_mesh_the_page_says_so(meshed, kept, tmp_path
     assert "no picture of a mesh" in (tmp_path / "page.html").read_text()
 
 
-def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
+def test_packed_mesh_agrees_with_the_mesh_file(made, meshed, tiny_scene):
     (shown,) = packed_meshes(made[2])
     mesh = load_mesh(meshed / "mesh" / "tsdf" / "mesh.ply")
     places, index = array(shown["places"], "<u2", 4), array(shown["index"], "<u4", 3)
@@ -180,7 +180,7 @@ def test_the_mesh_of_the_page_is_the_mesh_of_the_file(made, meshed, tiny_scene):
     assert f"{np.percentile(error, 95):.3g}" in shown["layers"][3]["legend"]
 
 
-def test_commands_repeat_the_run(made, meshed):
+def test_listed_commands_have_the_options_of_the_run(made, meshed):
     lines = "".join(
         next(each for each in made[2].iter("section") if each.get("id") == "repeat").find("pre").itertext()
     ).splitlines()
@@ -197,7 +197,7 @@ def test_commands_repeat_the_run(made, meshed):
     assert dataclasses.asdict(options) == stats["options"]
 
 
-def test_a_mesh_without_options_has_no_command(run_copy):
+def test_mesh_without_valid_options_has_no_command(run_copy):
     stats = extract_mesh(run_copy, options=ExtractOptions(level=0.7), quiet=True)
     file = run_copy / "mesh" / "tsdf" / "stats.json"
     for wrong in (None, {"smooth": "much"}):
@@ -207,7 +207,7 @@ def test_a_mesh_without_options_has_no_command(run_copy):
         assert "extract-mesh" not in Path(made["report"]).read_text()
 
 
-def test_a_run_without_mesh_scores_and_capture_says_so(run_copy, tiny_scene, tmp_path):
+def test_missing_mesh_scores_and_capture_are_reported(run_copy, tiny_scene, tmp_path):
     result = report_run(run_copy, tmp_path / "page.html")
     assert result["report"] == str(tmp_path / "page.html") and not (run_copy / "report.html").exists()
     assert result["views"] == 3 and result["meshes"] == []
@@ -225,7 +225,7 @@ def test_a_run_without_mesh_scores_and_capture_says_so(run_copy, tiny_scene, tmp
     assert all(str(escape(sentence)) in text for sentence in result["missing"])
 
 
-def test_effects_that_were_decided_are_shown(run_copy):
+def test_decisions_on_effects_are_shown(run_copy):
     config = json.loads((run_copy / "config.json").read_text())
     effect = {
         "name": "exposure",
@@ -250,7 +250,7 @@ def test_effects_that_were_decided_are_shown(run_copy):
     assert any(row[:4] == ["lens", "off", "the data say so", "spread: not measured"] for row in rows if row)
 
 
-def test_figures_that_are_not_finite_are_left_out_of_curves(run_copy):
+def test_curves_omit_non_finite_values(run_copy):
     def curves() -> list[str]:
         report_run(run_copy)
         return re.findall("<svg.*?</svg>", (run_copy / "report.html").read_text(), re.DOTALL)
@@ -261,7 +261,7 @@ def test_figures_that_are_not_finite_are_left_out_of_curves(run_copy):
     assert len(before) > 1 and curves() == before
 
 
-def test_scores_from_before_the_last_save_are_not_taken(run_copy):
+def test_scores_older_than_the_primitives_are_ignored(run_copy):
     eval_images_run(run_copy)
     file = run_copy / "eval" / "images" / "results.json"
     wrong = json.loads(file.read_text()) | {"psnr": 99.0}
@@ -278,7 +278,7 @@ def test_scores_from_before_the_last_save_are_not_taken(run_copy):
     assert "99.00 dB" not in Path(report_run(run_copy)["report"]).read_text()
 
 
-def test_a_reference_is_scored_against_without_leaving_results(run_copy, tiny_scene):
+def test_scores_for_a_given_reference_are_shown_but_not_saved(run_copy, tiny_scene):
     extract_mesh(run_copy, options=ExtractOptions(level=0.7), quiet=True)
     result = report_run(run_copy, reference=tiny_scene / "reference.ply")
     assert not (run_copy / "eval").exists() and result["missing"] == []
@@ -288,7 +288,7 @@ def test_a_reference_is_scored_against_without_leaving_results(run_copy, tiny_sc
         report_run(run_copy, reference=run_copy / "gone.ply")
 
 
-def test_a_full_disk_replaces_no_page(run_copy, tmp_path, monkeypatch):
+def test_full_disk_keeps_the_old_page(run_copy, tmp_path, monkeypatch):
     page = tmp_path / "r.html"
     page.write_text("before")
     monkeypatch.setattr(
@@ -299,7 +299,7 @@ def test_a_full_disk_replaces_no_page(run_copy, tmp_path, monkeypatch):
     assert page.read_text() == "before"
 
 
-def test_the_command_prints_one_object(run_copy, capfd, tmp_path):
+def test_report_command_prints_one_json_object(run_copy, capfd, tmp_path):
     assert cli.main(["report", str(run_copy), "-o", str(tmp_path / "r.html"), "--json"]) == 0
     shown = capfd.readouterr()
     assert json.loads(shown.out)["views"] == 3 and shown.out.count("\n") == 1 and (tmp_path / "r.html").exists()
@@ -307,7 +307,7 @@ def test_the_command_prints_one_object(run_copy, capfd, tmp_path):
     assert "config.json is missing" in capfd.readouterr().err
 
 
-# --- what pages and views share --------------------------------------------------------------------------
+# --- shared by reports and viewers --------------------------------------------------------------------------
 
 
 def ball(rings: int = 90) -> Mesh:
@@ -317,7 +317,7 @@ def ball(rings: int = 90) -> Mesh:
     return Mesh(np.asarray(made.vertices) + [500.0, -20.0, 3.0], np.asarray(made.faces))
 
 
-def test_a_light_mesh_is_near_the_old_one():
+def test_light_mesh_stays_near_the_full_mesh():
     mesh = ball()
     light, rows, cell = light_mesh(mesh, 3000)
     assert 1000 < len(light.faces) <= 3000 < len(mesh.faces) and cell > 0
@@ -327,7 +327,7 @@ def test_a_light_mesh_is_near_the_old_one():
     assert cell == 0 and np.array_equal(same.faces, mesh.faces) and np.array_equal(rows, np.arange(len(mesh.vertices)))
 
 
-def test_errors_share_one_scale_and_unknown_ones_are_grey():
+def test_error_layers_share_one_scale_and_unknown_errors_are_grey():
     mesh = ball(20)
     count = len(mesh.vertices)
     quality = np.full(count, 0.5, np.float32)
@@ -341,7 +341,7 @@ def test_errors_share_one_scale_and_unknown_ones_are_grey():
     assert [each.name for each in layers(mesh, np.arange(count))] == ["shape"]
 
 
-def test_up_is_what_level_cameras_agree_on(tiny_scene):
+def test_up_direction_of_level_cameras(tiny_scene):
     from linprim_geo.capture.load import load_scene
 
     cameras = [view.camera for view in load_scene(tiny_scene).train]
@@ -351,7 +351,7 @@ def test_up_is_what_level_cameras_agree_on(tiny_scene):
     assert up_direction(cameras[:1]) @ -cameras[0].rotation[1] > 0.99
 
 
-def test_cameras_within_a_mesh_are_told_from_those_around_it(tiny_scene):
+def test_cameras_inside_a_mesh_are_detected(tiny_scene):
     from linprim_geo.capture.load import load_scene
 
     cameras = [view.camera for view in load_scene(tiny_scene).train]

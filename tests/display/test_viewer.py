@@ -1,5 +1,4 @@
-"""The view of a run: what a browser is served, what the controls do, and that it follows a run that is being
-trained."""
+"""The viewer of a run: what the browser receives, the controls, and reloading during training."""
 
 from __future__ import annotations
 
@@ -50,7 +49,7 @@ def viewer(meshed, tiny_scene):
 
 
 def shown(viewer: Viewer, name: str):
-    """What the browser gets under a name: a trimesh with the colours of its vertices; None if there is nothing."""
+    """Return what the browser gets under a name, as a trimesh with colours of vertices, or None if there is nothing."""
     import trimesh
 
     handle = viewer._shown.get(name)
@@ -62,7 +61,7 @@ def shown(viewer: Viewer, name: str):
 
 
 def change(viewer: Viewer, **controls) -> None:
-    """Sets controls as a person does, and draws."""
+    """Set the values of controls and redraw."""
     for name, value in controls.items():
         getattr(viewer, f"_{name}").value = value
     viewer._draw()
@@ -73,7 +72,7 @@ def page(address: str) -> str:
         return answer.read().decode()
 
 
-def test_it_serves_a_page_to_this_machine_alone(viewer):
+def test_viewer_serves_a_page_on_localhost_only(viewer):
     assert re.fullmatch(r"http://localhost:\d+", viewer.address)
     text = page(viewer.address)
     assert "<html" in text and "<script" in text
@@ -91,7 +90,7 @@ def test_it_serves_a_page_to_this_machine_alone(viewer):
         ("null", "403"),
     ],
 )
-def test_pages_of_other_sites_in_the_same_browser_may_not_look(viewer, origin, status):
+def test_connections_from_other_origins_are_refused(viewer, origin, status):
     port = viewer.server.get_port()
     lines = [
         "GET / HTTP/1.1",
@@ -108,7 +107,7 @@ def test_pages_of_other_sites_in_the_same_browser_may_not_look(viewer, origin, s
         assert connection.recv(100).split()[1].decode() == status
 
 
-def test_primitives_are_polyhedra_from_an_opacity_on(viewer, meshed):
+def test_primitives_above_the_least_opacity_are_shown(viewer, meshed):
     primitives = Run.open(meshed).training_primitives()
     for least in (0.0, *np.quantile(primitives.alpha, [0.3, 0.8])):
         change(viewer, opacity=float(least))
@@ -129,13 +128,13 @@ def test_primitives_are_polyhedra_from_an_opacity_on(viewer, meshed):
     assert shown(viewer, "/primitives") is None
 
 
-def test_meshes_lie_on_the_primitives_and_show_their_errors(viewer, meshed):
+def test_meshes_are_shown_in_the_training_frame_with_their_layers(viewer, meshed):
     assert viewer._mesh.options == ("none", "tsdf") and shown(viewer, "/mesh") is None
     assert viewer._layer.options == ("photographs", "shape", "predicted error", "true error")
     change(viewer, mesh="tsdf", layer="photographs")
     mesh, body = load_mesh(meshed / "mesh" / "tsdf" / "mesh.ply"), shown(viewer, "/mesh")
     assert np.allclose(body.vertices, Run.open(meshed).similarity.apply(mesh.vertices), atol=1e-5)
-    # Linear numbers in the file are the photographs' colours on the screen.
+    # The file holds linear values, whose sRGB encoding is the colour of the photographs.
     linear = body.visual.vertex_attributes["color"][:, :3] / 255.0
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     assert np.abs(255 * srgb - mesh.colors)[mesh.colors > 60].max() < 4
@@ -147,7 +146,7 @@ def test_meshes_lie_on_the_primitives_and_show_their_errors(viewer, meshed):
     )
 
 
-def test_the_clipping_plane_cuts_both(viewer, meshed):
+def test_clipping_plane_cuts_mesh_and_primitives(viewer, meshed):
     change(viewer, mesh="tsdf", opacity=0.0, axis="x")
     whole = shown(viewer, "/mesh")
     center = Run.open(meshed).training_primitives().center[:, 0]
@@ -161,7 +160,7 @@ def test_the_clipping_plane_cuts_both(viewer, meshed):
     assert len(shown(viewer, "/mesh").faces) == len(whole.faces)
 
 
-def test_cameras_stand_where_photographs_were_taken(viewer, meshed):
+def test_camera_frusta_agree_with_the_cameras_of_the_scene(viewer, meshed):
     run = Run.open(meshed)
     frusta = {name: handle for name, handle in viewer._shown.items() if name.startswith(("/train/", "/test/"))}
     assert len(frusta) == 15 and sum(name.startswith("/test/") for name in frusta) == 3
@@ -184,7 +183,7 @@ def test_cameras_stand_where_photographs_were_taken(viewer, meshed):
     assert ahead @ first.rotation[2] / np.linalg.norm(ahead) > 0.9
 
 
-def test_what_stands_in_files_is_shown_and_not_run(meshed, tmp_path):
+def test_text_from_files_is_escaped(meshed, tmp_path):
     run = Path(shutil.copytree(meshed, tmp_path / "a_run_of *mine*"))
     notes = json.loads((run / "transform.json").read_text())
     evil = "<img src=x onerror=alert(1)> [m](http://x)"
@@ -193,15 +192,14 @@ def test_what_stands_in_files_is_shown_and_not_run(meshed, tmp_path):
     try:
         change(made, mesh="tsdf", layer="predicted error")
         for content in (made._legend.content, made._text.content):
-            # In CommonMark a backslash before any ASCII punctuation leaves that as it is, and no other punctuation is
-            # left.
+            # CommonMark takes escaped ASCII punctuation literally. No unescaped punctuation may be left.
             assert not re.search(r"[!-/:-@\[-`{-~]", re.sub(r"\\[!-/:-@\[-`{-~]", "", content))
         assert evil in re.sub(r"\\([!-/:-@\[-`{-~])", r"\1", made._legend.content)
     finally:
         made.close()
 
 
-def test_too_many_primitives_are_said_and_the_largest_shown(meshed, monkeypatch):
+def test_only_the_largest_primitives_are_shown_with_a_note_if_there_are_too_many(meshed, monkeypatch):
     monkeypatch.setattr(view_scene, "MOST_PRIMITIVE_FACES", 8 * 50)
     monkeypatch.setattr(view_scene, "MOST_MESH_FACES", 500)
     seen = view_scene.load_seen(meshed)
@@ -214,7 +212,7 @@ def test_too_many_primitives_are_said_and_the_largest_shown(meshed, monkeypatch)
     assert any("in place of" in note for note in seen.notes)
 
 
-def test_it_follows_a_run(tiny_run, tmp_path):
+def test_viewer_reloads_a_run_when_it_is_saved(tiny_run, tmp_path):
     path = tmp_path / "later"
     viewer = Viewer(path, 0, follow=True)
     try:
@@ -240,7 +238,7 @@ def test_it_follows_a_run(tiny_run, tmp_path):
         viewer.close()
 
 
-def test_what_cannot_be_shown_is_one_sentence(meshed, tmp_path, capfd, monkeypatch):
+def test_errors_of_the_view_command_are_one_sentence(meshed, tmp_path, capfd, monkeypatch):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -258,7 +256,7 @@ def test_what_cannot_be_shown_is_one_sentence(meshed, tmp_path, capfd, monkeypat
     assert not (tmp_path / "new").exists()
 
 
-def test_training_is_watched_only_if_asked(monkeypatch):
+def test_train_opens_a_viewer_only_with_the_view_flag(monkeypatch):
     import contextlib
     import types
 
@@ -279,7 +277,7 @@ def test_training_is_watched_only_if_asked(monkeypatch):
 
 
 def started(words: list[str], **settings) -> tuple[subprocess.Popen, str]:
-    """A process that has said where its view is; Ctrl-C reaches it even if those who started this one ignore it."""
+    """Start a process and return it with the address of its view. SIGINT is reset, as the parent may ignore it."""
     process = subprocess.Popen(
         [sys.executable, *words],
         stdout=subprocess.PIPE,
@@ -295,7 +293,7 @@ def started(words: list[str], **settings) -> tuple[subprocess.Popen, str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
+def test_interrupt_and_termination_end_without_an_error(meshed, number):
     process, address = started(["-m", "linprim_geo", "view", str(meshed), "--no-browser", "--port", "0", "--json"])
     assert page(address)
     process.send_signal(number)
@@ -303,7 +301,7 @@ def test_ctrl_c_and_a_request_to_end_are_no_errors(meshed, number):
     assert process.returncode == 0 and error == "" and f'"address": "{address}"' in out and out.count("\n") == 1
 
 
-def test_a_view_of_training_imports_nothing_from_the_folder_it_is_started_in(meshed, tmp_path):
+def test_view_of_training_imports_nothing_from_the_working_directory(meshed, tmp_path):
     plant_modules(tmp_path)
     program = "import sys\nfrom linprim_geo.display import viewer\nviewer._is_free = lambda port: False\n"
     words = ["-P", "-c", f"{program}with viewer.watched(sys.argv[1]):\n    sys.stdin.readline()\n", str(meshed)]
@@ -315,7 +313,7 @@ def test_a_view_of_training_imports_nothing_from_the_folder_it_is_started_in(mes
     assert line.startswith("http://localhost") and not (tmp_path / "imported").exists()
 
 
-def test_a_view_of_training_ends_with_it(meshed):
+def test_view_of_training_ends_with_the_training(meshed):
     program = "import sys, time, os\nfrom linprim_geo.display.viewer import watched\n"
     for end in ("", "    os._exit(1)\n"):  # the block ends, or the whole process does
         words = ["-c", f"{program}with watched(sys.argv[1]):\n    sys.stdin.readline()\n{end}", str(meshed)]
