@@ -1,4 +1,4 @@
-"""Executors do every task once, begin again what dies, keep what is done, and say in one sentence what cannot be."""
+"""Executors run every task once, restart what dies, keep finished results, and report errors in one sentence."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HERE = Path(__file__).resolve().parents[1] / "helpers"
 
 @pytest.fixture(scope="module", autouse=True)
 def importable():
-    """Workers find the tasks of these tests."""
+    """Let workers import the tasks of these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(HERE))
         yield
@@ -40,14 +40,14 @@ def importable():
 
 @pytest.fixture(scope="module")
 def ray(importable, tmp_path_factory):
-    """Ray on this machine, started once."""
+    """An executor on a local Ray cluster, started once."""
     with open_executor("local", tmp_path_factory.mktemp("ray"), 2) as executor:
         yield executor
 
 
 @pytest.fixture(params=["processes", pytest.param("ray", marks=pytest.mark.slow)])
 def executor(request, tmp_path):
-    """Either engine, with two workers and this test's folder."""
+    """Executor with two workers in the folder of the test, by processes or by Ray."""
     if request.param == "processes":
         with open_executor(None, tmp_path, 2) as started:
             yield started
@@ -77,7 +77,7 @@ def task(shared: Path, function: str, name: str = "t", **arguments) -> Task:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a child's peak begins with its parent's")
-def test_the_peak_of_a_worker_is_its_own(tmp_path):
+def test_peak_memory_of_a_worker_excludes_its_parent(tmp_path):
     large = bytearray(b"1") * 2**30
     assert peak_gib() > 1
     [done] = run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
@@ -96,7 +96,7 @@ def test_tasks_are_done_once_with_one_thread_each(executor, tmp_path):
         assert len((tmp_path / str(k) / "attempts").read_text().splitlines()) == 1
 
 
-def test_workers_import_nothing_from_the_folder_they_are_started_in(tmp_path, monkeypatch):
+def test_workers_import_nothing_from_the_working_directory(tmp_path, monkeypatch):
     plant_modules(tmp_path / "capture")
     monkeypatch.chdir(tmp_path / "capture")
     [done] = run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
@@ -104,14 +104,14 @@ def test_workers_import_nothing_from_the_folder_they_are_started_in(tmp_path, mo
 
 
 @pytest.mark.slow
-def test_workers_of_ray_import_nothing_from_the_folder_they_are_started_in(tmp_path):
+def test_workers_of_ray_import_nothing_from_the_working_directory(tmp_path):
     plant_modules(tmp_path / "capture")
     words = [sys.executable, "-P", str(HERE / "executor_tasks.py"), str(tmp_path), "local", "2", "0.1", "2"]
     done = subprocess.run(words, cwd=tmp_path / "capture", capture_output=True, text=True)
     assert done.returncode == 0 and not (tmp_path / "capture" / "imported").exists(), done.stderr
 
 
-def test_a_worker_that_dies_is_begun_again_and_goes_on(executor, tmp_path):
+def test_dead_worker_is_restarted(executor, tmp_path):
     results = run(
         [task(tmp_path, "die", times=2), task(tmp_path, "chain", "c", start="a", steps=5)], tmp_path, executor
     )
@@ -119,7 +119,7 @@ def test_a_worker_that_dies_is_begun_again_and_goes_on(executor, tmp_path):
     assert results[1]["value"] == chained("a", 5) and len((tmp_path / "c" / "attempts").read_text().splitlines()) == 1
 
 
-def test_a_task_that_always_dies_is_given_up_in_a_sentence(tmp_path):
+def test_task_that_always_dies_fails_after_some_attempts(tmp_path):
     with pytest.raises(LinprimError, match=f"t has died {ATTEMPTS} times, .* signal 9; .* wanted fewer of everything"):
         run([task(tmp_path, "die", times=99)], tmp_path)
     assert len((tmp_path / "t" / "deaths").read_text()) == ATTEMPTS
@@ -129,7 +129,7 @@ def test_a_task_that_always_dies_is_given_up_in_a_sentence(tmp_path):
     ("function", "sentence"),
     [("refuse", "holds nothing, wanted something"), ("divide", "t: internal error: ZeroDivisionError")],
 )
-def test_a_task_that_fails_stops_all_in_its_own_words(function, sentence, tmp_path):
+def test_failed_task_stops_all_and_its_error_is_reported(function, sentence, tmp_path):
     slow = task(tmp_path, "chain", "slow", start="a", steps=40, seconds=600.0)
     with open_executor(None, tmp_path, 2) as executor:
         with pytest.raises(LinprimError, match=sentence):
@@ -139,12 +139,12 @@ def test_a_task_that_fails_stops_all_in_its_own_words(function, sentence, tmp_pa
     assert not is_alive(process.pid) and not (tmp_path / "slow" / worker.DONE).exists()
 
 
-def test_a_worker_without_memory_is_reported_with_what_to_change(executor, tmp_path):
+def test_out_of_memory_is_reported_with_a_remedy(executor, tmp_path):
     with pytest.raises(LinprimError, match="t, of unknown need, ran out of memory .*: wanted fewer of everything"):
         run([task(tmp_path, "eat", gib=16.0)], tmp_path, executor)
 
 
-def test_a_worker_that_the_system_kills_for_memory_is_not_begun_again(tmp_path, monkeypatch):
+def test_worker_killed_for_memory_is_not_restarted(tmp_path, monkeypatch):
     kills = iter(range(10))
     monkeypatch.setattr("linprim_geo.jobs.processes._oom_kills", lambda: next(kills))
     with pytest.raises(LinprimError, match=r"ran out of memory \(the system killed it\): wanted fewer"):
@@ -152,7 +152,7 @@ def test_a_worker_that_the_system_kills_for_memory_is_not_begun_again(tmp_path, 
     assert (tmp_path / "t" / "deaths").read_text() == "x"
 
 
-def test_more_memory_than_there_is_is_refused_before_anything_begins(tmp_path):
+def test_task_that_needs_too_much_memory_is_refused_before_it_starts(tmp_path):
     big = Task(
         "big",
         "executor_tasks:chain",
@@ -169,7 +169,7 @@ def test_more_memory_than_there_is_is_refused_before_anything_begins(tmp_path):
 
 
 class Recorded(Executor):
-    """Ends one task per look; notes what ran together."""
+    """Ends one task at every poll and records which ran together."""
 
     def __init__(self, shared, cores, memory):
         super().__init__(shared)
@@ -189,7 +189,7 @@ class Recorded(Executor):
         pass
 
 
-def test_as_many_run_together_as_cores_and_memory_allow(tmp_path):
+def test_concurrent_tasks_are_limited_by_cores_and_memory(tmp_path):
     tasks = [
         Task(name, "m:f", {}, tmp_path / name, memory_gib=gib)
         for name, gib in (("a", 3.0), ("b", 2.0), ("c", 1.0), ("d", 1.0))
@@ -214,7 +214,7 @@ def test_a_folder_with_the_result_of_another_task_is_refused(tmp_path):
 # --- what cannot be ---------------------------------------------------------------------------------------
 
 
-def test_mixed_versions_and_another_folder_are_one_sentence_each(executor, tmp_path):
+def test_other_versions_or_another_folder_of_a_worker_are_refused(executor, tmp_path):
     one = task(tmp_path, "chain", start="a", steps=1)
     about = executor.about
     try:
@@ -239,7 +239,7 @@ def test_mixed_versions_and_another_folder_are_one_sentence_each(executor, tmp_p
 
 
 @pytest.mark.slow
-def test_a_cluster_that_is_not_there_is_one_sentence(tmp_path):
+def test_unreachable_cluster_is_reported(tmp_path):
     for address in ("127.0.0.1:9", "ray://127.0.0.1:9"):
         with pytest.raises(
             LinprimError, match=f"--cluster {address}: no Ray cluster answers there .* wanted local, or the address"
@@ -249,13 +249,13 @@ def test_a_cluster_that_is_not_there_is_one_sentence(tmp_path):
         open_executor("nowhere", tmp_path)
 
 
-def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
+def test_missing_ray_is_reported_with_the_extra_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(LinprimError, match=r"pip install 'linprim-geo\[cluster\]'"):
         open_executor("local", tmp_path)
 
 
-def test_ray_is_not_imported_unless_it_is_asked_for():
+def test_ray_is_imported_only_when_used():
     text = (
         "import sys, linprim_geo.jobs.executor, linprim_geo.cli.main; linprim_geo.cli.main.build_parser(); "
         "sys.exit('ray' in "
@@ -268,7 +268,7 @@ def test_ray_is_not_imported_unless_it_is_asked_for():
 
 
 def workers_at(shared: Path) -> list[int]:
-    """Processes that have begun a task and are at it."""
+    """Ids of the processes that run a task."""
     last = [file.read_text().splitlines()[-1].split()[0] for file in shared.glob("*/attempts") if file.read_text()]
     return [pid for pid in map(int, last) if is_alive(pid)]
 
@@ -300,10 +300,10 @@ def killed_at_random(shared: Path, cluster: str, kills: int, seconds: float, rng
     return drivers
 
 
-def test_workers_and_drivers_killed_at_random_lose_nothing(tmp_path):
+def test_random_kills_of_workers_and_drivers_lose_no_results(tmp_path):
     drivers = killed_at_random(tmp_path, "", 6, 1.5, random.Random(3))
     assert json.loads((tmp_path / "results.json").read_text()) == [chained(str(k), 40) for k in range(6)]
-    for k in range(6):  # what was saved was gone on with
+    for k in range(6):  # resumed from the saved step
         steps = [int(line.split()[1]) for line in (tmp_path / f"{k:02d}" / "attempts").read_text().splitlines()]
         assert steps == sorted(steps)
     assert drivers > 1
@@ -325,20 +325,20 @@ def test_workers_end_with_their_driver(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", ["", "local"], ids=["processes", "ray"])
-def test_twenty_kills_lose_nothing(cluster, tmp_path):
+def test_twenty_kills_lose_no_results(cluster, tmp_path):
     seconds = 40.0 if cluster else 6.0
     assert killed_at_random(tmp_path, cluster, 20, seconds, random.Random(7)) > 1
     assert json.loads((tmp_path / "results.json").read_text()) == [chained(str(k), 40) for k in range(6)]
 
 
-def test_a_marker_is_no_task(tmp_path):
+def test_incomplete_result_file_is_refused(tmp_path):
     (tmp_path / "t").mkdir()
     (tmp_path / "t" / worker.DONE).write_text("{}")
     with pytest.raises(LinprimError, match="done.json: is the result of other options"):
         run([task(tmp_path, "chain", start="a", steps=1)], tmp_path)
 
 
-def test_processes_have_as_many_workers_as_cores(tmp_path):
+def test_default_number_of_workers_is_the_number_of_cores(tmp_path):
     with Processes(tmp_path) as executor:
         assert executor.workers == usable_cores()
     with pytest.raises(LinprimError, match="--workers is -1"):
