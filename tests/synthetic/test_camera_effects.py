@@ -1,4 +1,4 @@
-"""Effects of a camera have the size and the unit that they claim, and none of them changes what it should not."""
+"""Effects of a camera: size and unit of each, and values that they must not change."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ SMALL = {"views": 6, "test_views": 2, "size": (64, 48), "supersample": 1, "point
 
 
 def photographed(values, **options):
-    """`values` as the first held-out photograph of a camera."""
+    """Apply the effects to `values` as the first held-out photograph."""
     return effects.CameraEffects(SynthOptions(**options)).apply(np.asarray(values, np.float32), "test", 0)
 
 
@@ -28,13 +28,13 @@ def test_linear_and_srgb_are_inverse():
     np.testing.assert_allclose(to_srgb(to_linear(values)), values, atol=1e-9)
 
 
-def test_without_effects_the_picture_is_the_same_object():
+def test_image_is_returned_unchanged_without_effects():
     picture = np.full((4, 5, 3), 0.3, np.float32)
     assert effects.CameraEffects(SynthOptions(noise=2.0)).apply(picture, "train", 3) is picture
 
 
 @pytest.mark.parametrize("light", [0.02, 0.2, 0.8])
-def test_noise_has_the_variance_of_photons_and_electronics(light):
+def test_noise_variance_is_shot_noise_plus_read_noise(light):
     well, read = 5000.0, 20.0
     seen = effects.exposed(np.full((300, 300, 1), light), well, read, np.random.default_rng(0)) * well
     electrons = light * well
@@ -43,7 +43,7 @@ def test_noise_has_the_variance_of_photons_and_electronics(light):
     assert seen.var() == pytest.approx(electrons + read**2, rel=5 * np.sqrt(2 / seen.size))
 
 
-def test_corners_lose_the_share_that_vignetting_says():
+def test_vignetting_darkens_corners_by_the_given_share():
     seen = to_linear(photographed(np.full((101, 201, 3), 0.7), vignetting=0.4))
     middle = float(to_linear(0.7))
     # The middle of the corner pixel is half a pixel inside the corner.
@@ -52,7 +52,7 @@ def test_corners_lose_the_share_that_vignetting_says():
     assert seen[0, 0] == pytest.approx(middle * (1 - 0.4 * inside), rel=1e-5)
 
 
-def test_a_mosaic_keeps_what_a_pixel_measures_and_blurs_the_rest():
+def test_demosaicing_keeps_measured_values_and_interpolates_the_rest():
     rng = np.random.default_rng(0)
     light = rng.random((10, 12, 3))
     seen = effects.demosaiced(light)
@@ -60,17 +60,17 @@ def test_a_mosaic_keeps_what_a_pixel_measures_and_blurs_the_rest():
     np.testing.assert_allclose(seen[1::2, 1::2, 2], light[1::2, 1::2, 2])
     np.testing.assert_allclose(seen[::2, 1::2, 1], light[::2, 1::2, 1])
     np.testing.assert_allclose(seen[1::2, ::2, 1], light[1::2, ::2, 1])
-    # Red of a green pixel in a row of red ones is the mean of its neighbours, of a blue one that of its four corners.
+    # Red is the mean of two neighbours at a green pixel in a row of red ones, and of four corners at a blue pixel.
     np.testing.assert_allclose(seen[2, 3, 0], (light[2, 2, 0] + light[2, 4, 0]) / 2)
     np.testing.assert_allclose(seen[3, 3, 0], light[2:5:2, 2:5:2, 0].mean())
     np.testing.assert_allclose(seen[4, 4, 1], (light[3, 4, 1] + light[5, 4, 1] + light[4, 3, 1] + light[4, 5, 1]) / 4)
-    # What is linear is the same but for the border: interpolation is exact there.
+    # Interpolation is exact for a linear image except at the border.
     ramp = np.indices((10, 12)).sum(0)[..., None] * np.ones(3) / 30
     np.testing.assert_allclose(effects.demosaiced(ramp)[1:-1, 1:-1], ramp[1:-1, 1:-1])
     np.testing.assert_allclose(photographed(np.full((8, 8, 3), 0.4), mosaic="bayer"), 0.4, atol=1e-6)
 
 
-def test_motion_blur_is_a_line_of_its_length_and_keeps_the_light():
+def test_motion_blur_is_a_line_of_the_given_length_and_keeps_the_sum():
     dot = np.zeros((81, 81, 1))
     dot[40, 40] = 1.0
     lengths = []
@@ -86,7 +86,7 @@ def test_motion_blur_is_a_line_of_its_length_and_keeps_the_light():
     assert np.mean(lengths) == pytest.approx(6.0, rel=0.15)
 
 
-def test_exposure_and_white_balance_walk_smoothly_within_their_limits():
+def test_exposure_and_white_balance_vary_smoothly_within_their_limits():
     drawn = effects.CameraEffects(SynthOptions(views=60, exposure_walk=0.5, white_balance=0.1))
     assert np.abs(drawn.stops).max() == pytest.approx(0.5) and abs(drawn.stops.mean()) < 1e-12
     assert np.abs(drawn.balance).max() == pytest.approx(0.1)
@@ -101,14 +101,14 @@ def test_exposure_and_white_balance_walk_smoothly_within_their_limits():
     np.testing.assert_allclose(drawn.apply(grey, "test", 0), grey, atol=1e-6)
 
 
-def test_tone_curve_keeps_black_middle_and_white_and_rises():
+def test_tone_curve_is_increasing_and_fixes_black_middle_and_white():
     values = np.linspace(0.0, 1.0, 101)
     seen = effects.toned(values, 1.0)
     np.testing.assert_allclose(seen[[0, 50, 100]], [0.0, 0.5, 1.0], atol=1e-12)
     assert (np.diff(seen) > 0).all() and seen[25] < 0.25 and seen[75] > 0.75
 
 
-def test_pose_errors_move_points_by_the_pixels_that_were_asked_for():
+def test_pose_errors_move_projections_by_the_given_pixels():
     camera = Camera(640, 480, 600.0, 600.0, 320.0, 240.0, look_at(np.array([4.0, 0.0, 1.0]), np.zeros(3)))
     distance = float(np.linalg.norm(camera.center))
     moved = reported([camera] * 4000, 0.8, 0.0, distance, (3,))
@@ -120,7 +120,7 @@ def test_pose_errors_move_points_by_the_pixels_that_were_asked_for():
     assert reported([camera], 0.0, 0.005, distance, (3,))[0].fx == pytest.approx(603.0)
 
 
-def test_phone_switches_everything_on_and_what_is_said_wins():
+def test_phone_enables_all_effects_and_explicit_options_win():
     phone = effects.with_camera(SynthOptions(camera="phone", jpeg=75))
     assert phone.jpeg == 75
     assert all(getattr(phone, name) == value for name, value in effects.PHONE.items() if name != "jpeg")
@@ -129,7 +129,7 @@ def test_phone_switches_everything_on_and_what_is_said_wins():
     assert all(getattr(default, name) != value for name, value in effects.PHONE.items())
 
 
-def test_wrong_cameras_are_written_and_the_true_ones_beside_them(tmp_path):
+def test_true_cameras_are_written_beside_cameras_with_errors(tmp_path):
     synthesize(tmp_path / "true", **SMALL)
     synthesize(tmp_path / "told", pose_error=1.0, focal_error=0.01, **SMALL)
     true, told = (json.loads((tmp_path / name / "transforms_train.json").read_text()) for name in ("true", "told"))
@@ -144,7 +144,7 @@ def test_wrong_cameras_are_written_and_the_true_ones_beside_them(tmp_path):
         assert (tmp_path / "true" / name).read_bytes() == (tmp_path / "told" / name).read_bytes()
 
 
-def test_the_same_seed_gives_the_same_files_and_another_one_does_not(tmp_path):
+def test_photographs_depend_on_the_seed_and_not_on_threads(tmp_path):
     many = {"full_well": 4000.0, "motion_blur": 1.0, "vignetting": 0.2, "jpeg": 90, **SMALL}
     for name, seed, threads in (("a", 1, 1), ("b", 1, 2), ("c", 2, 1)):
         synthesize(tmp_path / name, seed=seed, threads=threads, path="orbit", **many)
@@ -170,12 +170,12 @@ def test_points_are_triangulated_from_the_photographs(tmp_path):
         ({"camera": "camera"}, "--camera is 'camera'"),
     ],
 )
-def test_effects_that_cannot_be_are_refused(tmp_path, options, said):
+def test_contradictory_effects_are_refused(tmp_path, options, said):
     with pytest.raises(LinprimError, match=said):
         synthesize(tmp_path / "out", views=4, test_views=1, size=(32, 32), **options)
     assert not (tmp_path / "out").exists()
 
 
-def test_options_of_other_values_are_kept():
+def test_phone_keeps_other_options():
     options = replace(SynthOptions(), camera="phone", views=12)
     assert effects.with_camera(options).views == 12

@@ -1,4 +1,4 @@
-"""The courtyard: its old masonry has the shape that is asked for, its walls are closed, its cameras stand free."""
+"""The courtyard: shapes of its masonry, closed walls, and cameras clear of surfaces."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ GREY = Material(color=(0.5, 0.5, 0.5))
 
 @pytest.fixture(scope="module")
 def yard():
-    """The courtyard as it is photographed by 45 views, and its rays."""
+    """The courtyard with 45 training views, and its ray caster."""
     options = SynthOptions(views=45, test_views=4, size=(64, 48), realism="courtyard")
     traced = scenes.TracedScene("courtyard", None, options)
     return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
@@ -36,7 +36,7 @@ def yard():
         lambda seed: masonry.flagstones(SMALL_WALL, seed),
     ],
 )
-def test_masonry_repeats_by_seed_has_contrast_and_is_nearly_flat(make):
+def test_masonry_depends_on_its_seed_has_contrast_and_is_nearly_flat(make):
     first, again, other = make(1), make(1), make(2)
     assert np.array_equal(first.image, again.image) and np.array_equal(first.relief, again.relief)
     assert not np.array_equal(first.image, other.image)
@@ -45,7 +45,7 @@ def test_masonry_repeats_by_seed_has_contrast_and_is_nearly_flat(make):
     assert 0.001 < first.relief.std() and np.abs(first.relief).max() < 0.06
 
 
-def test_plaster_is_plain_where_it_is_sound_and_bricks_lie_deeper_where_it_is_off():
+def test_sound_plaster_has_little_contrast_and_exposed_bricks_lie_deeper():
     skin = masonry.old_plaster((3.0, 3.0), (0.8, 0.7, 0.5), 0, [(0.8, 1.6, 0.5, 0.5)])
     x, z = masonry.places(skin.size)
     inside, sound = np.hypot(x - 0.8, z - 1.6) < 0.1, (x > 1.7) & (z > 1.0) & (z < 2.3)
@@ -53,7 +53,7 @@ def test_plaster_is_plain_where_it_is_sound_and_bricks_lie_deeper_where_it_is_of
     assert skin.relief[inside].mean() < skin.relief[sound].mean() - 0.006
 
 
-def test_an_uneven_wall_faces_the_yard_and_has_its_openings_and_straight_edges():
+def test_uneven_wall_has_open_holes_straight_edges_and_outward_normals():
     skin = masonry.rubble(SMALL_WALL, 3)
     hole = (0.7, 1.2, 0.4, 1.1)
     wall = masonry.uneven_wall("wall", skin, [hole])
@@ -69,7 +69,7 @@ def test_an_uneven_wall_faces_the_yard_and_has_its_openings_and_straight_edges()
     assert rim.sum() > 100 and (y[rim] == 0).all() and y.std() > 0.002
 
 
-def test_the_slabs_of_a_floor_are_numbered_and_their_edges_are_where_numbers_change():
+def test_slabs_are_numbered_and_edge_distance_is_small_between_slabs():
     number, edge, middles = masonry.slabs((2.0, 1.6), (0.3, 0.5), (0.4, 0.8), 0)
     assert 0 <= number.min() and number.max() < len(middles) and (edge >= -1e-9).all()
     changes = (number[:, 1:] != number[:, :-1]).nonzero()
@@ -77,7 +77,7 @@ def test_the_slabs_of_a_floor_are_numbered_and_their_edges_are_where_numbers_cha
     assert edge.max() > 0.12
 
 
-def test_an_arch_is_round_closed_to_its_rectangle_and_faces_outwards():
+def test_arch_fills_its_rectangle_and_faces_outward():
     skin = masonry.rubble((4.0, 3.6), 0)
     _, above, below = masonry.round_arches(1.6, 0.4, 0.5, 2, 2.0)
     assert above[0] == pytest.approx((0.5, 2.1, 2.0, 2.85)) and above[1] == pytest.approx((2.5, 4.1, 2.0, 2.85))
@@ -94,7 +94,7 @@ def test_an_arch_is_round_closed_to_its_rectangle_and_faces_outwards():
     assert ((normal[face] * ways).sum(1)[[0, 2, 3]] < -0.99).all()
 
 
-def test_roof_tiles_lie_above_their_wall_and_reach_over_the_yard():
+def test_roof_tiles_lie_above_the_wall_and_overhang_the_yard():
     pieces = masonry.eaves((0.0, 3.0), 4.0, GREY, 0, out=0.3, depth=1.2)
     points = np.concatenate([part.vertices for part in pieces])
     assert points[:, 1].min() == pytest.approx(-0.3) and points[:, 1].max() > 1.2
@@ -102,7 +102,7 @@ def test_roof_tiles_lie_above_their_wall_and_reach_over_the_yard():
     assert tiles.vertices[:, 2].min() > 4.0 and unit_normals(tiles.vertices, tiles.faces)[:, 2].min() > -1e-9
 
 
-def test_parts_of_one_material_become_one_and_keep_their_shapes_and_colors():
+def test_merged_parts_share_a_material_and_keep_shapes_and_colors():
     image = Material(color=np.full((2, 2, 3), 90, np.uint8))
     some = [
         parts.quad("a", (0, 0, 0), (1, 0, 0), (0, 1, 0), image),
@@ -120,7 +120,7 @@ def test_parts_of_one_material_become_one_and_keep_their_shapes_and_colors():
     assert {corners.tobytes() for corners in before} == {corners.tobytes() for corners in after}
 
 
-def test_the_slats_of_a_shutter_keep_the_rain_out_and_stay_within_its_frame():
+def test_shutter_has_the_given_size():
     leaf = courtyard_things.shutter(0.45, 1.3, GREY)
     low, high = leaf.vertices.min(0), leaf.vertices.max(0)
     np.testing.assert_allclose([*low, *high], [0, -0.04, 0, 0.45, 0, 1.3], atol=0.005)
@@ -129,12 +129,12 @@ def test_the_slats_of_a_shutter_keep_the_rain_out_and_stay_within_its_frame():
 # The scene
 
 
-def test_the_rounds_through_the_courtyard_are_free(yard):
+def test_courtyard_cameras_are_clear_of_surfaces(yard):
     traced, caster = yard
     assert nearest_surface(traced, caster) > 0.5
 
 
-def test_two_thirds_of_the_steps_through_the_courtyard_are_short_and_turn_little(yard):
+def test_most_steps_between_courtyard_cameras_are_short_with_small_turns(yard):
     views = yard[0].train
     eyes, ahead = np.array([view.center for view in views]), np.array([view.world_to_camera[2, :3] for view in views])
     step = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
@@ -143,7 +143,7 @@ def test_two_thirds_of_the_steps_through_the_courtyard_are_short_and_turn_little
     assert (eyes[:, 2] > 1.1).all() and (eyes[:, 2] < 1.8).all()
 
 
-def test_what_is_seen_of_the_courtyard_faces_the_camera_and_only_the_sky_is_open(yard):
+def test_courtyard_surfaces_face_the_camera_and_only_sky_rays_miss(yard):
     traced, caster = yard
     normals = unit_normals(caster.vertices, caster.faces)
     facing = []
@@ -158,7 +158,7 @@ def test_what_is_seen_of_the_courtyard_faces_the_camera_and_only_the_sky_is_open
     assert np.min(facing) > 0.9 and np.mean(facing) > 0.985
 
 
-def test_the_paving_is_uneven_by_centimetres_and_the_walls_reach_below_it():
+def test_paving_is_uneven_by_centimetres_and_stays_above_the_foot_of_walls():
     floor = masonry.uneven_floor("paving", masonry.flagstones((3.0, 2.0), 0))
     height = floor.vertices[:, 2]
     assert 0.003 < height.std() < 0.02 and height.min() > masonry.FOOT
@@ -166,7 +166,7 @@ def test_the_paving_is_uneven_by_centimetres_and_the_walls_reach_below_it():
     np.testing.assert_allclose([floor.vertices[:, i].min() for i in (0, 1)], [0.0, -2.0], atol=1e-9)
 
 
-def test_the_backdrop_of_the_courtyard_is_beyond_its_walls_and_no_part_of_its_surface(yard):
+def test_courtyard_backdrop_is_outside_the_walls_and_not_in_the_surface(yard):
     traced, caster = yard
     points = np.concatenate([part.vertices for part in traced.backdrop])
     beyond = (points[:, 0] > courtyard.LENGTH + courtyard.ASIDE) | (points[:, 0] < -courtyard.ASIDE)

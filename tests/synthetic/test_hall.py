@@ -7,7 +7,7 @@ from helpers.surfaces import edge_uses
 from linprim_geo.synthetic import hall
 
 
-def test_the_hall_is_a_closed_surface_with_a_checker_of_the_strength_asked_for():
+def test_hall_is_closed_and_its_checker_has_the_given_contrast():
     shape = hall.hall()
     assert shape.path == "inside-out" and (edge_uses(shape.faces) == 2).all()
     box = np.ptp(shape.vertices, axis=0)

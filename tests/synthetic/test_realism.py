@@ -39,7 +39,7 @@ def volume(part: Part) -> float:
     return float(np.einsum("nc,nc->n", a, np.cross(b, c)).sum() / 6.0)
 
 
-def test_boxes_and_turned_profiles_have_their_volume_and_face_outwards():
+def test_boxes_spheres_and_tubes_have_their_size_and_outward_faces():
     stone = Material()
     assert volume(parts.box("b", (1, 2, 3), (2, 4, 6), stone)) == pytest.approx(6.0)
     ball = parts.sphere("s", (1.0, 2.0, 3.0), 0.5, stone, segments=256)
@@ -49,7 +49,7 @@ def test_boxes_and_turned_profiles_have_their_volume_and_face_outwards():
     np.testing.assert_allclose(radius, 0.1, rtol=1e-9)
 
 
-def test_textures_repeat_by_seed_and_have_contrast():
+def test_textures_depend_on_their_seed_and_have_contrast():
     for make in (
         lambda seed: textures.wood((64, 128), 3, seed),
         lambda seed: textures.brick(128, seed),
@@ -62,7 +62,7 @@ def test_textures_repeat_by_seed_and_have_contrast():
         assert np.array_equal(first, make(1)) and not np.array_equal(first, make(2))
 
 
-def test_colors_of_the_reference_are_those_of_the_texture():
+def test_reference_colors_agree_with_the_texture():
     image = np.zeros((2, 2, 3), np.uint8)
     image[0], image[1] = (255, 0, 0), (0, 0, 255)  # the first row is the upper one
     wall = parts.quad("wall", (0, 0, 0), (1, 0, 0), (0, 0, 1), Material(color=image))
@@ -73,7 +73,7 @@ def test_colors_of_the_reference_are_those_of_the_texture():
     np.testing.assert_allclose(surface.colors(points, face, bary), [[0, 0, 1], [1, 0, 0]], atol=1e-6)
 
 
-def test_every_scene_can_be_asked_for():
+def test_every_scene_is_a_choice_of_the_option():
     (option,) = (entry for entry in fields(SynthOptions) if entry.name == "realism")
     assert sorted(option.metadata["choices"]) == sorted(scenes.SCENES)
 
@@ -94,12 +94,12 @@ def test_cameras_stand_in_free_space_and_see_the_scene(name):
 
 @pytest.fixture(scope="module")
 def walked():
-    """The kitchen as it is photographed by 40 views, and its rays."""
+    """The kitchen with 40 training views, and its ray caster."""
     traced = scenes.TracedScene("kitchen", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="kitchen"))
     return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
 
 
-def test_a_walk_takes_even_steps_and_its_held_out_views_lie_between():
+def test_walk_has_even_steps_with_held_out_views_in_between():
     corners = np.array([[1.0, 1, 0], [3, 1, 0], [3, 3, 0], [1, 3, 0]])
     middle = np.tile([2.0, 2.0, 1.4], (4, 1))
     train, test = walk(corners, middle, 40, 8, seed=3)
@@ -118,7 +118,7 @@ def test_a_walk_takes_even_steps_and_its_held_out_views_lie_between():
     assert not np.array_equal(train, walk(corners, middle, 40, 8, seed=4)[0])
 
 
-def test_a_pierced_wall_faces_the_room_and_its_hole_is_open():
+def test_pierced_wall_has_an_open_hole_and_faces_the_room():
     hole = interiors.pierced_wall((4.0, 2.5), Material(), (1.0, 2.0), (0.8, 1.8), 0.3)
     surface = scenes.surface_of(render.Stage(interiors.on_wall("right", (5.0, 4.0, 2.5), hole)), "wall")
     caster = RayCaster(surface.vertices, surface.faces)
@@ -133,22 +133,22 @@ def test_a_pierced_wall_faces_the_room_and_its_hole_is_open():
     np.testing.assert_allclose(facing, [[-1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]], atol=1e-12)
 
 
-def test_the_kitchen_has_whole_faces_and_lies_within_its_walls():
+def test_kitchen_has_few_degenerate_faces_and_lies_within_its_walls():
     stage = kitchen.kitchen_scene(smooth_body(), 0)
     low, high = np.array([0.0, -kitchen.DEPTH, 0.0]), np.array([kitchen.WIDTH, 0.0, kitchen.HEIGHT])
     for part in stage.parts:
         a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        # Flat are only triangles at the axes of turned pieces, and at the poles of the figure.
+        # Only triangles at the axes of turned parts and at the poles of the figure are degenerate.
         flat = area < 1e-12
         assert not flat.any() or part.name == "face" or part.smooth, part.name
         assert flat.mean() <= 0.5, part.name
-        # Only window, door and niche go into the walls.
+        # Only window, door and niche reach into the walls.
         assert (part.vertices > low - 0.25).all() and (part.vertices < high + 0.25).all(), part.name
         assert (part.vertices[:, 2] > -1e-9).all() and (part.vertices[:, 2] < high[2] + 1e-9).all(), part.name
 
 
-def test_what_is_seen_of_the_kitchen_faces_the_camera_and_nothing_is_open(walked):
+def test_kitchen_surfaces_face_the_camera_and_no_ray_misses(walked):
     traced, caster = walked
     normals = unit_normals(caster.vertices, caster.faces)
     for view in traced.train[::4]:
@@ -158,10 +158,10 @@ def test_what_is_seen_of_the_kitchen_faces_the_camera_and_nothing_is_open(walked
         assert (towards < 0).mean() > 0.999
 
 
-def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
+def test_kitchen_cameras_are_clear_of_surfaces_and_cover_the_room(walked):
     traced, caster = walked
     assert nearest_surface(traced, caster) > 0.25
-    # The surface as rays from anywhere on the free floor meet it, each place as often as its area asks for.
+    # Surface points hit by rays from the free floor, sampled in proportion to area.
     rng, probe = np.random.default_rng(0), fibonacci_directions(500)
     eyes = np.repeat(rng.uniform((1.4, -3.0, 1.0), (3.7, -0.9, 1.8), (60, 3)), len(probe), axis=0)
     rays = np.tile(probe, (60, 1))
@@ -180,7 +180,7 @@ def test_the_walk_through_the_kitchen_is_free_and_sees_nearly_all_of_it(walked):
     assert (count[ceiling] >= 3).mean() > 0.9 and (count[floor] >= 3).mean() > 0.85
 
 
-def test_the_walk_through_the_bedroom_is_free():
+def test_bedroom_cameras_are_clear_of_surfaces():
     traced = scenes.TracedScene("bedroom", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="bedroom"))
     caster = RayCaster(traced.surface.vertices, traced.surface.faces)
     assert nearest_surface(traced, caster) > 0.4
@@ -191,12 +191,12 @@ def test_the_walk_through_the_bedroom_is_free():
 
 @pytest.fixture(scope="module")
 def terraced():
-    """The terrace as it is photographed by 40 views, and its rays."""
+    """The terrace with 40 training views, and its ray caster."""
     traced = scenes.TracedScene("terrace", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="terrace"))
     return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
 
 
-def test_a_hedge_and_a_crown_of_leaves_are_where_they_are_asked_for():
+def test_hedge_and_foliage_have_the_given_position_and_size():
     rng = np.random.default_rng(0)
     hedge = outdoors.hedge((1.0, 2.0, 0.0), (1.0, 8.0, 0.0), 1.7, rng)
     low, high = hedge.vertices.min(0), hedge.vertices.max(0)
@@ -209,7 +209,7 @@ def test_a_hedge_and_a_crown_of_leaves_are_where_they_are_asked_for():
     assert np.linalg.norm(edge, axis=1).max() < 0.1
 
 
-def test_parts_that_are_painted_as_one_keep_their_shapes_and_colors():
+def test_painted_parts_keep_shapes_and_colors():
     red = parts.box("red", (0, 0, 0), (1, 1, 1), Material(color=(0.8, 0.1, 0.1)))
     leaves = outdoors.foliage("leaves", np.zeros((3, 3)), 0.1, outdoors.GREEN, np.random.default_rng(0))
     both = outdoors.painted("both", [red, leaves])
@@ -220,7 +220,7 @@ def test_parts_that_are_painted_as_one_keep_their_shapes_and_colors():
     np.testing.assert_array_equal(both.vertices[both.faces], corners)
 
 
-def test_the_terrace_has_whole_faces_and_stands_on_its_lawn(terraced):
+def test_terrace_has_few_degenerate_faces_and_stands_on_its_lawn(terraced):
     for part in terraced[0].stage.parts:
         a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
         flat = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1) < 1e-12
@@ -230,12 +230,12 @@ def test_the_terrace_has_whole_faces_and_stands_on_its_lawn(terraced):
         assert (part.vertices[:, 2] > terrace.LAWN - 0.2).all(), part.name
 
 
-def test_the_walk_over_the_terrace_is_free(terraced):
+def test_terrace_cameras_are_clear_of_surfaces(terraced):
     traced, caster = terraced
     assert nearest_surface(traced, caster) > 0.25
 
 
-def test_a_third_of_the_photographs_of_the_terrace_is_far_and_some_show_nothing_far(terraced):
+def test_a_third_of_the_terrace_pixels_is_far_and_some_views_show_nothing_far(terraced):
     traced, caster = terraced
     far = []
     for view in traced.train:
@@ -247,7 +247,7 @@ def test_a_third_of_the_photographs_of_the_terrace_is_far_and_some_show_nothing_
     assert np.quantile(far, 0.2) < 0.02 and np.quantile(far, 0.6) > 0.4
 
 
-def test_the_backdrop_of_the_terrace_is_far_and_no_part_of_its_surface(terraced):
+def test_terrace_backdrop_is_far_and_not_in_the_surface(terraced):
     traced, caster = terraced
     points = np.concatenate([part.vertices for part in traced.backdrop])
     for view in traced.train + traced.test:
@@ -259,17 +259,17 @@ def test_the_backdrop_of_the_terrace_is_far_and_no_part_of_its_surface(terraced)
 
 @pytest.fixture(scope="module")
 def round_table():
-    """The garden as it is photographed by 40 views, and its rays."""
+    """The garden with 40 training views, and its ray caster."""
     traced = scenes.TracedScene("garden", None, SynthOptions(views=40, test_views=4, size=(64, 48), realism="garden"))
     return traced, RayCaster(traced.surface.vertices, traced.surface.faces)
 
 
-def test_the_walk_round_the_table_is_free(round_table):
+def test_garden_cameras_are_clear_of_surfaces(round_table):
     traced, caster = round_table
     assert nearest_surface(traced, caster) > 0.4
 
 
-def test_the_backdrop_of_the_garden_is_far_and_no_part_of_its_surface(round_table):
+def test_garden_backdrop_is_far_and_not_in_the_surface(round_table):
     traced, caster = round_table
     points = np.concatenate([part.vertices for part in traced.backdrop])
     # It begins where the lawn ends.
@@ -281,7 +281,7 @@ def test_the_backdrop_of_the_garden_is_far_and_no_part_of_its_surface(round_tabl
     assert caster.diagonal < 30.0
 
 
-def test_the_sun_of_the_day_is_where_it_is_asked_for():
+def test_sun_has_the_given_direction():
     sky = outdoors.day(0, (236.0, 50.0), 180)
     row, column = np.unravel_index(sky.sum(-1).argmax(), sky.shape[:2])
     assert abs(row + 0.5 - 40.0) <= 1.0 and abs(column - 236.0) <= 1.0
@@ -291,12 +291,12 @@ def test_the_sun_of_the_day_is_where_it_is_asked_for():
 @pytest.mark.parametrize(
     ("option", "value"), [("table", 2.0), ("environment", 1), ("path", "arc"), ("distortion", 0.1)]
 )
-def test_options_that_a_scene_decides_are_refused(option, value, tmp_path):
+def test_options_that_the_scene_determines_are_refused(option, value, tmp_path):
     with pytest.raises(LinprimError, match=f"--{option} is {value}, but the scene of --realism desk has its own"):
         synthesize(tmp_path / "out", realism="desk", **{option: value})
 
 
-def test_without_mitsuba_one_sentence_says_what_to_install(monkeypatch, tmp_path):
+def test_missing_mitsuba_is_reported_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(LinprimError, match=r"pip install linprim-geo\[realism\]"):
         synthesize(tmp_path / "out", realism="statue", **SMALL)
@@ -307,7 +307,7 @@ def test_without_mitsuba_one_sentence_says_what_to_install(monkeypatch, tmp_path
 
 
 @needs_mitsuba
-def test_edges_in_the_picture_are_where_the_camera_projects_them():
+def test_rendered_patch_lies_at_its_projection():
     # A dark square on a bright wall, lit evenly by the sky: its middle is that of the projection.
     bright, dark = Material(color=(0.9, 0.9, 0.9)), Material(color=(0.05, 0.05, 0.05))
     wall = parts.quad("wall", (-9, 0, -9), (18, 0, 0), (0, 0, 18), bright)
@@ -323,7 +323,7 @@ def test_edges_in_the_picture_are_where_the_camera_projects_them():
 
 
 @needs_mitsuba
-def test_a_grey_wall_under_an_even_sky_reflects_its_share():
+def test_radiance_of_a_wall_under_a_uniform_sky_is_its_albedo():
     # Under a sky of radiance 1 on all sides a plane of albedo a has radiance a.
     wall = parts.quad("wall", (-9, 0, -9), (18, 0, 0), (0, 0, 18), Material(color=(0.5, 0.5, 0.5)))
     stage = render.Stage([wall], sky=np.ones((8, 16, 3), np.float32))
@@ -334,7 +334,7 @@ def test_a_grey_wall_under_an_even_sky_reflects_its_share():
 
 
 @needs_denoiser
-def test_a_denoised_picture_has_no_grain_and_its_textures_and_edges():
+def test_denoising_removes_grain_and_keeps_textures():
     bright, dark = Material(color=(0.9, 0.9, 0.9)), Material(color=(0.3, 0.3, 0.3))
     stripes = np.where(np.arange(64) % 8 < 4, 230, 120).astype(np.uint8)
     stripes = Material(color=np.broadcast_to(stripes[None, :, None], (64, 64, 3)))
@@ -361,7 +361,7 @@ def test_a_denoised_picture_has_no_grain_and_its_textures_and_edges():
 
 
 @needs_mitsuba
-def test_without_the_denoiser_one_sentence_says_what_to_install(monkeypatch, tmp_path):
+def test_missing_denoiser_is_reported_with_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     with pytest.raises(LinprimError, match=r"--denoise on .* pip install linprim-geo\[realism\]"):
         synthesize(tmp_path / "out", realism="statue", denoise="on", **SMALL)
@@ -369,7 +369,7 @@ def test_without_the_denoiser_one_sentence_says_what_to_install(monkeypatch, tmp
 
 
 @needs_mitsuba
-def test_the_sky_is_where_its_rows_and_columns_say():
+def test_rows_and_columns_of_the_sky_map_to_directions():
     sky = np.zeros((32, 64, 3), np.float32)
     sky[:16] = 1.0  # the upper half
     sky[:, 12:20, 0] += 1.0  # azimuth 90 degrees from +y towards +x
@@ -382,7 +382,7 @@ def test_the_sky_is_where_its_rows_and_columns_say():
 
 
 @needs_mitsuba
-def test_a_capture_can_be_trained_and_does_not_clip(tmp_path):
+def test_capture_loads_and_is_hardly_clipped(tmp_path):
     report = synthesize(tmp_path / "a", realism="statue", **SMALL)
     assert report["unit"] == "m" and report["realism"] == "statue"
     scene = load_scene(tmp_path / "a")
@@ -394,7 +394,7 @@ def test_a_capture_can_be_trained_and_does_not_clip(tmp_path):
 
 
 @needs_mitsuba
-def test_the_same_seed_gives_the_same_picture_and_another_one_does_not():
+def test_rendering_depends_on_the_seed_and_not_on_threads():
     ball = parts.sphere("ball", (0.0, 0.0, 0.0), 0.5, Material("metal", roughness=0.2), segments=24)
     stage = render.Stage([ball], sky=np.random.default_rng(0).uniform(0, 1, (8, 16, 3)))
     view = camera((0, -2, 0), (0, 0, 0))
@@ -403,7 +403,7 @@ def test_the_same_seed_gives_the_same_picture_and_another_one_does_not():
     assert not np.array_equal(first, render.PathTracer(stage).render(view, 4, 8)[0])
 
 
-def test_what_is_no_number_or_far_too_bright_touches_no_other_pixel():
+def test_outliers_are_replaced_without_changing_other_pixels():
     rng = np.random.default_rng(0)
     images = rng.uniform(0.4, 0.6, (2, 8, 8, 3)).astype(np.float32)
     usual = render.without_outliers(images)

@@ -1,4 +1,4 @@
-"""Built-in shapes are what they claim: closed, of the intended genus and size, textured everywhere, always the same."""
+"""Built-in shapes: closed surfaces of the intended genus and size, textures with contrast, and reproducibility."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def built():
 
 
 @pytest.mark.parametrize("name, handles", [("cad", 10), ("smooth", 1), ("room", None)])
-def test_solid_shapes_are_closed_oriented_and_of_the_intended_genus(built, name, handles):
+def test_solid_shapes_are_closed_and_oriented_with_the_intended_genus(built, name, handles):
     shape = built[name]
     assert (edge_uses(shape.faces) == 2).all()
     directed = shape.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -33,7 +33,7 @@ def test_solid_shapes_are_closed_oriented_and_of_the_intended_genus(built, name,
         assert len(shape.vertices) - edges + len(shape.faces) == 2 - 2 * handles
 
 
-def test_objects_are_centred_with_diagonal_two_and_coloured_in_pieces(built):
+def test_objects_are_centred_with_diagonal_two_and_numbered_parts(built):
     for name in ("cad", "smooth", "wires"):
         shape = built[name]
         assert np.abs(shape.center).max() < 1e-12 and shape.diagonal == pytest.approx(2.0, abs=1e-12)
@@ -50,14 +50,14 @@ def test_wires_are_closed_and_the_sheet_is_open(built):
     assert set(uses) == {1, 2} and (uses == 1).sum() == 4 * 95
 
 
-def test_the_thinnest_rib_and_wire_are_as_thin_as_documented(built):
+def test_ribs_have_the_documented_thickness(built):
     caster = RayCaster(built["cad"].vertices, built["cad"].faces)
     assert caster.diagonal == pytest.approx(2.0)
     # Across the ribs: pairs of crossings along y through the three ribs at x = -0.33, half-way up.
     scale = 2.0 / np.linalg.norm([1.6, 1.1, 0.85])
     origin = np.array([-0.33 * scale, -2.0, 0.0])
     origin[2] = built["cad"].vertices[:, 2].min() + 0.25 * scale
-    # Casting goes on 1e-3 behind each surface that was met, a thirtieth of a rib.
+    # Each cast starts 1e-3 behind the last hit, a thirtieth of a rib.
     crossings, y = [], -2.0
     for _ in range(12):
         t, face, _ = caster.cast(np.array([origin[0], y, origin[2]]), np.array([[0.0, 1.0, 0.0]]))
@@ -69,7 +69,7 @@ def test_the_thinnest_rib_and_wire_are_as_thin_as_documented(built):
     assert np.sum(np.abs(gaps - 0.028 * scale) < 1e-6) == 3
 
 
-def test_the_smooth_body_lies_on_its_field_and_its_facets_within_two_hundredths_of_a_percent():
+def test_smooth_body_lies_on_its_level_set_within_tolerance():
     vertices, faces = shapes._body_surface(128)
     value, gradient = shapes._body_field(vertices)
     assert np.abs(value).max() < 1e-9
@@ -85,7 +85,7 @@ def test_the_smooth_body_lies_on_its_field_and_its_facets_within_two_hundredths_
     assert np.linalg.norm(corner - np.roll(corner, 1, axis=1), axis=2).max() < 0.015 * diagonal
 
 
-def test_shapes_and_their_colours_are_the_same_every_time(built):
+def test_shapes_and_colours_are_reproducible(built):
     for name, first in built.items():
         again = SHAPES[name]()
         assert np.array_equal(first.vertices, again.vertices) and np.array_equal(first.faces, again.faces)
@@ -94,12 +94,12 @@ def test_shapes_and_their_colours_are_the_same_every_time(built):
         bary = np.zeros((3000, 2))
         colors = first.colors(points, face, bary)
         assert np.array_equal(colors, again.colors(points, face, bary))
-        # Blocks inside must not show.
+        # Colours must not depend on the blocks in which they are computed.
         assert np.allclose(colors[1500:1600], first.colors(points[1500:1600], face[1500:1600], bary[:100]), atol=1e-6)
         assert colors.min() >= 0.0 and colors.max() <= 1.0
 
 
-def test_texture_is_nowhere_flat_and_has_no_wavelength_below_its_limit():
+def test_texture_has_contrast_everywhere_and_is_band_limited():
     albedo = procedural_albedo(np.zeros(1, int))
     rng = np.random.default_rng(1)
     steps = np.linspace(-0.1, 0.1, 64)
@@ -119,7 +119,7 @@ def test_texture_is_nowhere_flat_and_has_no_wavelength_below_its_limit():
     assert spectrum[cycles > 1.1 / 0.055].sum() < 1e-3 * spectrum.sum()
 
 
-def test_refining_keeps_the_surface_the_seams_and_the_topology(built):
+def test_refinement_keeps_area_boundary_and_topology(built):
     for name in ("cad", "wires"):
         shape = built[name]
         vertices, faces, colors = shape.refined(0.08)
@@ -132,7 +132,7 @@ def test_refining_keeps_the_surface_the_seams_and_the_topology(built):
     assert euler == len(shape.vertices) - len(edge_uses(shape.faces)) + len(shape.faces)
 
 
-def test_subdivision_leaves_no_long_edge_and_no_crack():
+def test_subdivision_limits_edge_lengths_and_leaves_no_cracks():
     rng = np.random.default_rng(2)
     vertices = np.concatenate([rng.uniform(-1, 1, (6, 2)), np.zeros((6, 1))], 1)
     from scipy.spatial import Delaunay

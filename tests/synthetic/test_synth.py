@@ -55,7 +55,7 @@ def cameras_of(out, split):
 
 
 @pytest.mark.parametrize("path", ["orbit", "hemisphere", "sphere"])
-def test_paths_around_an_object_frame_it_and_test_views_lie_between(built, path):
+def test_camera_paths_frame_the_object_with_test_views_in_between(built, path):
     surface = built["cad"]
     base = Camera(100, 80, 120.0, 120.0, 50.0, 40.0, np.eye(4))
     center = surface.center + 1.0
@@ -82,7 +82,7 @@ def test_paths_around_an_object_frame_it_and_test_views_lie_between(built, path)
     assert (up.min() > 0) == (path == "hemisphere") and up.max() > 0.6
 
 
-def test_inside_out_cameras_stay_clear_of_every_surface_and_cover_the_room(built):
+def test_inside_out_cameras_are_clear_of_surfaces_and_cover_the_room(built):
     import igl
 
     room = built["room"]
@@ -91,7 +91,7 @@ def test_inside_out_cameras_stay_clear_of_every_surface_and_cover_the_room(built
     assert len(train) == 40 and len(test) == 8
     centers = np.array([-p[:3, :3].T @ p[:3, 3] for p in train + test])
     squared = igl.point_mesh_squared_distance(centers, room.vertices, room.faces)[0]
-    # Probing rays are 192 directions, so a surface may be a little nearer than the nearest ray says.
+    # Clearance is probed in 192 directions only, so a surface may be a little nearer than the nearest hit.
     assert np.sqrt(squared).min() > 0.5 * campath.CLEARANCE * room.diagonal
     assert (centers > [0, 0, 0]).all() and (centers < [6, 5, 2.7]).all()
     forward = np.array([p[2, :3] for p in train])
@@ -105,7 +105,7 @@ def test_inside_out_cameras_stay_clear_of_every_surface_and_cover_the_room(built
     assert np.array_equal(np.array(again[0]), np.array(train))
 
 
-def test_inside_out_of_an_object_says_that_there_is_no_room(built):
+def test_inside_out_path_without_free_space_is_refused(built):
     caster = RayCaster(built["wires"].vertices, built["wires"].faces)
     with pytest.raises(LinprimError, match="no free space"):
         campath.inside_out(caster, 4, 1, (0.6, 0.6), seed=0)
@@ -114,7 +114,7 @@ def test_inside_out_of_an_object_says_that_there_is_no_room(built):
 # A capture
 
 
-def test_capture_has_all_files_and_the_report_says_what_was_made(capture):
+def test_capture_has_all_files_and_a_complete_report(capture):
     out, report = capture
     for split, count in (("train", 8), ("test", 3)):
         for folder in (split, f"depth/{split}", f"normal/{split}", f"masks/{split}"):
@@ -124,7 +124,7 @@ def test_capture_has_all_files_and_the_report_says_what_was_made(capture):
     assert not [entry for entry in out.parent.iterdir() if entry.name.startswith(".")]
 
 
-def test_rendered_views_are_counted_on_stderr_unless_quiet(tmp_path, built, monkeypatch, capsys):
+def test_progress_is_printed_unless_quiet(tmp_path, built, monkeypatch, capsys):
     monkeypatch.setattr(progress, "time", types.SimpleNamespace(monotonic=itertools.count(0, 30).__next__))
     small = SMALL | {"views": 2, "test_views": 1}
     synthesize(tmp_path / "shown", mesh=built["cad"], **small)
@@ -134,7 +134,7 @@ def test_rendered_views_are_counted_on_stderr_unless_quiet(tmp_path, built, monk
     assert capsys.readouterr().err == ""
 
 
-def test_depth_normals_and_masks_are_those_of_the_surface_at_pixel_centres(capture, built):
+def test_depth_normals_and_masks_agree_with_ray_casts_at_pixel_centres(capture, built):
     out, _ = capture
     surface = built["cad"]
     caster = RayCaster(surface.vertices, surface.faces)
@@ -158,7 +158,7 @@ def test_depth_normals_and_masks_are_those_of_the_surface_at_pixel_centres(captu
             assert (mask[inner.all(0)] > 120).all() and (mask[~inner.any(0)] < 140).all()
 
 
-def test_pixels_have_the_albedo_of_the_surface_behind_them(tmp_path, built):
+def test_pixels_have_the_albedo_of_the_surface(tmp_path, built):
     surface = built["smooth"]
     synthesize(tmp_path / "a", mesh=surface, **{**SMALL, "supersample": 1, "views": 2, "background": "white"})
     caster = RayCaster(surface.vertices, surface.faces)
@@ -174,7 +174,7 @@ def test_pixels_have_the_albedo_of_the_surface_behind_them(tmp_path, built):
     assert (tmp_path / "a/truth_masks").is_dir() and not (tmp_path / "a/masks").exists()
 
 
-def test_a_transparent_capture_laid_over_black_is_the_black_capture(tmp_path, built):
+def test_transparent_capture_over_black_agrees_with_the_black_capture(tmp_path, built):
     for background in ("transparent", "0,0,0"):
         synthesize(tmp_path / background, mesh=built["cad"], background=background, **SMALL)
     rgba, black = (
@@ -185,7 +185,7 @@ def test_a_transparent_capture_laid_over_black_is_the_black_capture(tmp_path, bu
     assert np.abs(rgba[..., :3] * rgba[..., 3:] / 255.0 - black).max() <= 1.01
 
 
-def test_points_lie_on_the_surface_are_seen_and_carry_their_error(capture, built):
+def test_points_have_consistent_tracks_colours_and_errors(capture, built):
     import pycolmap
 
     out, report = capture
@@ -211,7 +211,7 @@ def test_points_lie_on_the_surface_are_seen_and_carry_their_error(capture, built
             t, face, bary = caster.cast(camera.center, ray[None])
             true.append(camera.center + t[0] * ray)
             residual.append(np.linalg.norm(camera.project(point.xyz[None])[0] - [x, y]))
-        # All observations meet the surface in one and the same point, the one before the noise.
+        # Rays of all observations meet the surface at the same point, the position without noise.
         assert np.ptp(np.array(true), axis=0).max() < 1e-5
         color = surface.colors(true[0][None], face, bary)[0]
         assert np.abs(point.color / 255.0 - color).max() < 0.02
@@ -224,7 +224,7 @@ def test_points_lie_on_the_surface_are_seen_and_carry_their_error(capture, built
     assert report["mean_track_length"] > 3
 
 
-def test_the_reader_of_scenes_agrees_with_the_writer(capture):
+def test_loaded_scene_agrees_with_the_written_capture(capture):
     out, _ = capture
     scene = load_scene(out)
     assert len(scene.train) == 8 and len(scene.test) == 3
@@ -238,7 +238,7 @@ def test_the_reader_of_scenes_agrees_with_the_writer(capture):
     assert len(scene.points.xyz) == 400
 
 
-def test_reference_mesh_is_the_surface_in_the_frame_of_the_cameras(capture, built):
+def test_reference_mesh_agrees_with_the_surface(capture, built):
     from linprim_geo.geometry.mesh_files import load_mesh
 
     out, _ = capture
@@ -261,7 +261,7 @@ def test_files_do_not_depend_on_the_threads(tmp_path, built):
             assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "3" / name).read_bytes(), name
 
 
-def test_shading_follows_the_lamps_and_float_depth_is_exact(tmp_path):
+def test_shading_agrees_with_lambert_and_float_depth_is_exact(tmp_path):
     vertices = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
     gray = TexturedMesh(
         "plate", vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(2, int), lambda p, f, b: p * 0 + 0.5
@@ -307,7 +307,7 @@ def textured_quad(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])
-def test_texture_of_a_file_is_the_right_way_up(tmp_path, suffix):
+def test_texture_of_a_file_has_the_right_orientation(tmp_path, suffix):
     surface = load_textured(textured_quad(tmp_path, suffix))
     points = np.array([[0.25, 0.75, 0], [0.75, 0.75, 0], [0.25, 0.25, 0], [0.75, 0.25, 0]])
     caster = RayCaster(surface.vertices, surface.faces)
@@ -316,7 +316,7 @@ def test_texture_of_a_file_is_the_right_way_up(tmp_path, suffix):
     assert colors.tolist() == [[200, 10, 10], [10, 180, 10], [10, 10, 220], [255, 255, 255]]
 
 
-def test_vertex_colours_are_interpolated_and_a_bare_mesh_gets_a_texture(tmp_path):
+def test_vertex_colours_are_interpolated_and_a_mesh_without_colours_gets_a_texture(tmp_path):
     import trimesh
 
     vertices = np.array([[0, 0, 5e5], [1, 0, 5e5], [0, 1, 5e5]])
@@ -380,13 +380,13 @@ def test_a_capture_of_a_mesh_file_far_from_the_origin(tmp_path):
         ({"tracer": "llvm"}, "--tracer is llvm, but nothing is path-traced"),
     ],
 )
-def test_options_without_meaning_are_refused_and_leave_nothing(tmp_path, options, words):
+def test_invalid_options_are_refused_and_leave_no_files(tmp_path, options, words):
     with pytest.raises(LinprimError, match=words):
         synthesize(tmp_path / "out", **{**SMALL, **options})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_folder_is_kept_unless_it_is_ours_and_may_go(tmp_path, built):
+def test_existing_folder_is_replaced_only_if_it_is_a_capture_and_overwrite_is_set(tmp_path, built):
     out = tmp_path / "out"
     out.mkdir()
     (out / "precious.txt").write_text("mine")
@@ -408,7 +408,7 @@ def test_an_existing_folder_is_kept_unless_it_is_ours_and_may_go(tmp_path, built
 
 
 @pytest.mark.parametrize("interruption", [KeyboardInterrupt, OSError(28, "No space left on device")])
-def test_an_interrupted_capture_leaves_nothing(tmp_path, built, monkeypatch, interruption):
+def test_interrupted_capture_leaves_no_files(tmp_path, built, monkeypatch, interruption):
     def stop(*_):
         raise interruption
 

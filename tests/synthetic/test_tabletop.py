@@ -32,7 +32,7 @@ def part():
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory, part):
-    """PNG without noise: every pixel has a closed form."""
+    """A capture as PNG without noise, so that every pixel has a closed form."""
     out = tmp_path_factory.mktemp("tabletop") / "part"
     report = synthesize(out, mesh=part, table=2.5, environment=4, seed=5, distance=3.4, **SMALL)
     return out, report
@@ -52,7 +52,7 @@ def cameras_of(out, split):
 # Table
 
 
-def test_the_table_is_a_slab_whose_top_is_at_the_lowest_point_of_the_object(part):
+def test_table_is_a_slab_below_the_lowest_point_of_the_object(part):
     moved = TexturedMesh("moved", part.vertices + [10.0, -7.0, 3.3], part.faces, part.part, part.albedo)
     for surface in (part, moved):
         both = on_table(surface, 3.0)
@@ -70,7 +70,7 @@ def test_the_table_is_a_slab_whose_top_is_at_the_lowest_point_of_the_object(part
         assert set(both.part[len(surface.faces) :]) == {surface.part.max() + 1}
 
 
-def test_vertices_that_no_face_uses_do_not_lift_or_widen_the_table(part):
+def test_unreferenced_vertices_do_not_change_the_table(part):
     stray = np.concatenate([part.vertices, [[50.0, 0.0, -50.0]]])
     loose = TexturedMesh("loose", stray, part.faces, part.part, part.albedo)
     assert np.array_equal(on_table(loose, 2.0).vertices[-8:], on_table(part, 2.0).vertices[-8:])
@@ -94,14 +94,14 @@ def test_colours_of_the_object_do_not_change_on_a_table(tmp_path, part, kind):
     points = np.einsum("nc,ncd->nd", weight, surface.vertices[surface.faces[face]])
     alone = surface.colors(points, face, bary)
     assert np.array_equal(both.colors(points, face, bary), alone)
-    # Among points of the table, whose blocks are others.
+    # The same points mixed with points of the table, which changes the blocks.
     table = rng.integers(len(surface.faces), len(both.faces), 1500)
     mixed = rng.permutation(3000)
     together = both.colors(np.tile(points, (2, 1))[mixed], np.append(face, table)[mixed], np.tile(bary, (2, 1))[mixed])
     assert np.abs(together[np.argsort(mixed)][:1500] - alone).max() < 1e-6
 
 
-def test_wood_is_continuous_nowhere_flat_and_not_finer_than_its_limit(part):
+def test_wood_texture_is_continuous_has_contrast_and_is_band_limited(part):
     both = on_table(part, 4.0)
     wood, first = both.albedo.table, len(part.faces)
     side, unit = wood.side, wood.unit
@@ -155,7 +155,7 @@ def test_depth_normals_masks_points_and_reference_contain_the_table(capture, par
 # Environment
 
 
-def test_the_environment_depends_on_the_direction_alone_and_on_its_seed():
+def test_environment_depends_on_direction_and_seed_only():
     rng = np.random.default_rng(2)
     directions = rng.normal(size=(20_000, 3))
     room = synthetic_environment(4)
@@ -170,7 +170,7 @@ def test_the_environment_depends_on_the_direction_alone_and_on_its_seed():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_edges_of_the_environment_are_soft_all_round(seed):
+def test_edges_of_the_environment_are_smooth(seed):
     room, rng = synthetic_environment(seed), np.random.default_rng(seed)
     step = np.deg2rad(0.02)
     angle = np.arange(0.0, 2.0 * np.pi, step)
@@ -182,7 +182,7 @@ def test_edges_of_the_environment_are_soft_all_round(seed):
         assert color.std() > 0.02
 
 
-def test_pixels_whose_rays_miss_everything_are_the_environment_of_their_direction(capture):
+def test_pixels_without_a_hit_show_the_environment(capture):
     out, report = capture
     room = synthetic_environment(4)
     seen = 0
@@ -205,7 +205,7 @@ def test_pixels_whose_rays_miss_everything_are_the_environment_of_their_directio
 
 
 @pytest.mark.parametrize("degrees, views, held_out", [(300.0, 40, 8), (120.0, 9, 20), (360.0, 24, 1), (90.0, 5, 0)])
-def test_an_arc_is_walked_within_its_limits_and_held_out_views_lie_between(degrees, views, held_out):
+def test_arc_stays_within_its_limits_with_held_out_views_in_between(degrees, views, held_out):
     center, distance = np.array([3.0, -2.0, 0.7]), 4.0
     train, test = campath.arc(views, held_out, center, distance, degrees, seed=6)
     again = campath.arc(views, held_out, center, distance, degrees, seed=6)
@@ -230,7 +230,7 @@ def test_an_arc_is_walked_within_its_limits_and_held_out_views_lie_between(degre
     assert np.abs(azimuth[views:]).max(initial=0.0) < 0.5 * degrees
 
 
-def test_a_capture_with_a_table_is_an_arc_round_the_object_above_the_table(capture, part):
+def test_capture_with_a_table_uses_an_arc_above_the_table(capture, part):
     out, report = capture
     assert (report["path"], report["arc"], report["distance"], report["table"]) == ("arc", 300.0, 3.4, 2.5)
     middle = 0.5 * (part.vertices.min(0) + part.vertices.max(0))
@@ -240,7 +240,7 @@ def test_a_capture_with_a_table_is_an_arc_round_the_object_above_the_table(captu
             assert 0.9 * 3.4 <= np.linalg.norm(camera.center - middle) <= 1.1 * 3.4
 
 
-def test_without_a_distance_an_arc_has_that_of_a_hemisphere_around_the_object(tmp_path, part):
+def test_default_distance_of_an_arc_is_that_of_a_hemisphere(tmp_path, part):
     few = {**SMALL, "views": 3, "test_views": 0, "size": 16, "points": 0}
     arc = synthesize(tmp_path / "arc", mesh=part, table=6.0, arc=90, **few)
     dome = synthesize(tmp_path / "dome", mesh=part, path="hemisphere", **few)
@@ -250,7 +250,7 @@ def test_without_a_distance_an_arc_has_that_of_a_hemisphere_around_the_object(tm
 # Noise and JPEG
 
 
-def test_noise_has_the_stated_variance_half_of_which_grows_with_the_signal():
+def test_noise_variance_grows_with_the_signal_as_stated():
     for value in (0.1, 0.5, 0.9):
         clean = np.full((300, 300, 3), value, dtype=np.float32)
         noise = sensor_noise(clean, 2.0, (0, 1)) - clean
@@ -264,7 +264,7 @@ def test_noise_has_the_stated_variance_half_of_which_grows_with_the_signal():
     assert sensor_noise(clean, 0.0, (0, 1)) is clean
 
 
-def test_noise_of_a_capture_is_that_of_its_strength_and_differs_from_view_to_view(tmp_path, part):
+def test_noise_of_a_capture_has_the_given_strength_and_is_independent_between_views(tmp_path, part):
     gray = {
         **SMALL,
         "views": 2,
@@ -289,7 +289,7 @@ def test_noise_of_a_capture_is_that_of_its_strength_and_differs_from_view_to_vie
             assert np.abs(np.corrcoef(views[i].ravel() - 127.5, views[j].ravel() - 127.5)[0, 1]) < 0.15
 
 
-def test_a_jpeg_capture_is_read_with_opaque_photographs_and_is_near_the_png(tmp_path, part):
+def test_jpeg_capture_has_no_alpha_and_is_close_to_png(tmp_path, part):
     for jpeg in (0, 92):
         synthesize(tmp_path / str(jpeg), mesh=part, table=2.0, environment=1, jpeg=jpeg, **SMALL)
     out = tmp_path / "92"
@@ -347,7 +347,7 @@ def test_files_do_not_depend_on_the_threads(tmp_path, part):
         ({"jpeg": 90}, "transparent"),
     ],
 )
-def test_options_without_meaning_are_refused_and_leave_nothing(tmp_path, part, options, words):
+def test_invalid_options_are_refused_and_leave_no_files(tmp_path, part, options, words):
     with pytest.raises(LinprimError, match=words):
         synthesize(tmp_path / "out", mesh=part, **{**SMALL, **options})
     assert list(tmp_path.iterdir()) == []
@@ -356,7 +356,7 @@ def test_options_without_meaning_are_refused_and_leave_nothing(tmp_path, part, o
 # Named captures and the command
 
 
-def test_named_captures_are_made_of_meshes_in_a_folder_the_right_way_up(tmp_path):
+def test_named_capture_turns_its_mesh_upright(tmp_path):
     import trimesh
 
     # Longest along y, blue at its upper end.
@@ -379,7 +379,7 @@ def test_named_captures_are_made_of_meshes_in_a_folder_the_right_way_up(tmp_path
         tabletop_captures.tabletop("round_table", tmp_path / "other", tmp_path)
 
 
-def test_every_named_capture_has_arguments_of_synthesize_within_their_ranges():
+def test_named_captures_have_valid_options_and_different_tables():
     known = {"mesh"} | {field.name for field in dataclasses.fields(SynthOptions)}
     tables = [settings["table"] for settings in tabletop_captures.TABLETOPS.values()]
     assert len(set(tables)) == len(tables) == 3
@@ -389,7 +389,7 @@ def test_every_named_capture_has_arguments_of_synthesize_within_their_ranges():
     assert set(tabletop_captures.ALL_TABLETOPS) <= known
 
 
-def test_the_command_passes_them_on(monkeypatch):
+def test_synth_command_passes_options_on(monkeypatch):
     calls = []
     stand_in = types.SimpleNamespace(synthesize=lambda out, options, **_: calls.append(options) or {})
     monkeypatch.setitem(sys.modules, "linprim_geo.synthetic.synth", stand_in)
