@@ -90,7 +90,7 @@ def test_option_folders_of_older_runs_are_found(option, capture, tmp_path, monke
         assert found(option, Run.open(tmp_path / f"run_{name}").scene()) == expected(option, folder)
 
 
-def test_resuming_reports_ignored_options(tiny_scene, run_copy, capsys):
+def test_resuming_names_options_without_effect(tiny_scene, run_copy, capsys):
     own = Run.open(run_copy).train_options
     words = f"train {tiny_scene} -o {run_copy} --resume --effects auto --effect exposure=on"
     assert own.iterations != 7000 and own.max_primitives == 300
@@ -102,7 +102,7 @@ def test_resuming_reports_ignored_options(tiny_scene, run_copy, capsys):
     assert line.strip() == f"--resume goes on with the run's own options: {flags} ignored"
 
 
-def test_resuming_without_ignored_options_reports_nothing(tiny_scene, run_copy, capsys):
+def test_resuming_with_its_own_options_reports_nothing(tiny_scene, run_copy, capsys):
     assert main(["train", str(tiny_scene), "-o", str(run_copy), "--resume", "--threads", "1"]) == 0
     assert "ignored" not in capsys.readouterr().err
 
