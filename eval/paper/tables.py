@@ -183,7 +183,8 @@ def _options(args: argparse.Namespace, cap: int) -> TrainOptions:
     return TrainOptions(
         iterations=args.iterations,
         max_primitives=cap,
-        stereo_depth=0.0,  # the papers train on photographs alone
+        coarse="off",  # the papers train on whole photographs
+        stereo_depth=0.0,  # and on photographs alone
         sh_degree=args.sh_degree,
         samples=args.samples,
         seed=args.seed,

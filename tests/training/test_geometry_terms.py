@@ -97,27 +97,35 @@ def test_depth_error_is_relative_capped_and_weighted():
     assert float(terms.depth_error(torch.zeros(2), torch.ones(2))) == 0
 
 
-@pytest.mark.parametrize(("column", "row"), [(0, 0), (2, 1)])
-def test_plane_error_counts_beyond_the_margin_of_stereo(column, row):
-    """A tilted plane in an image averaged down by 3, compared at one of the nine pixels of each pixel."""
-    full, small = camera(), smaller(camera(), 3)
+@pytest.mark.parametrize(
+    ("factor", "stride", "column", "row"), [(1, 3, 0, 0), (1, 3, 2, 1), (2, 1, 0, 0), (3, 1, 0, 0), (4, 1, 0, 0)]
+)
+def test_plane_error_counts_beyond_the_margin_of_stereo(factor, stride, column, row):
+    """A tilted plane in an image averaged down by 3, compared at one of the nine pixels of each pixel, or with a depth
+    map that is averaged down itself."""
+    full, small = smaller(camera(), factor), smaller(camera(), 3)
     depth = plane_depth(full, NORMAL, OFFSET)
     inverse = 1 / plane_depth(small, NORMAL, OFFSET)
     planes = torch.zeros(3, *inverse.shape, dtype=torch.float64)
     planes[:, :-1, :-1] = torch.stack([inverse, *torch.gradient(inverse, dim=(1, 0))])[:, :-1, :-1]
 
     def error(depth: torch.Tensor) -> torch.Tensor:
-        return terms.plane_error(depth, planes, 3, column, row)
+        return terms.plane_error(depth, planes, 3 / factor, stride, column, row)
 
     for share in (-0.03, 0.02):
         assert float(error(depth * (1 + share))) == pytest.approx(abs(share) - terms.CONFIRMED_DEPTH, abs=1e-9)
     assert float(error(depth * 1.005)) == 0 == float(error(depth * 0))
-    assert float(error(3 * depth)) == terms.DEPTH_CAP
+    assert float(error(3 * depth)) == pytest.approx(terms.DEPTH_CAP, rel=1e-12)
     off = (1.02 * depth).requires_grad_()
     (gradient,) = torch.autograd.grad(error(off), off)
-    height, width = inverse.shape
+    # The last row and the last column of the planes are unknown.
+    rows, columns = (
+        [(i + 0.5) * factor / 3 < size - 1 for i in range(n)]
+        for n, size in zip(depth.shape, inverse.shape, strict=True)
+    )
     wanted = torch.zeros_like(depth)
-    wanted[row::3, column::3][: height - 1, : width - 1] = 1
+    wanted[row::stride, column::stride] = 1
+    wanted *= torch.tensor(rows)[:, None] & torch.tensor(columns)
     wanted *= 1 / depth / wanted.sum()
     assert (gradient - wanted).abs().max() < 1e-9
 

@@ -104,7 +104,7 @@ def error_at_stereo(run: Run) -> float:
     maps = stereo_surfaces(scene, OPTIONS, QUIET).maps
     depths = [torch.from_numpy(depth) for _, depth, _ in run.surface_depths(scene.train, 0.5)]
     errors = [
-        plane_error(depth, torch.from_numpy(found.planes), found.view.factor, 0, 0)
+        plane_error(depth, torch.from_numpy(found.planes), found.view.factor, found.view.factor, 0, 0)
         for depth, found in zip(depths, maps, strict=True)
     ]
     return float(np.mean(errors))

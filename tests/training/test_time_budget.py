@@ -51,7 +51,9 @@ def test_step_cost_is_a_line_through_both_calibrations():
     assert cost.seconds(1000) == pytest.approx(0.0065)
     assert StepCost.fit((100, 0.004), (500, 0.002)) == StepCost(0.003, 0.0)  # negative slope by noise
     assert StepCost.fit((100, 0.001), (500, 0.010)) == StepCost(0.0, 2e-5)  # more than in proportion
-    assert StepCost(0.01, 0.0, late=3.0, late_share=0.25).seconds(5) == pytest.approx(0.015)
+    phases = StepCost(0.01, 0.0, [[0.0, 0.5], [0.5, 1.0], [0.75, 3.0]])
+    assert phases.seconds(5) == pytest.approx(0.0125)
+    assert phases.mean(0.6, 1.0) == pytest.approx((0.15 + 0.75) / 0.4) and phases.mean(0.5, 0.6) == pytest.approx(1.0)
 
 
 def test_mean_population_agrees_with_exponential_growth():
@@ -62,7 +64,9 @@ def test_mean_population_agrees_with_exponential_growth():
 
 
 @pytest.mark.parametrize("start", [0.25, 0.8, 1.0])
-@pytest.mark.parametrize("cost", [StepCost(0.004, 1e-6), StepCost(0.0, 2e-6), StepCost(0.003, 1e-6, 2.0, 0.3)])
+@pytest.mark.parametrize(
+    "cost", [StepCost(0.004, 1e-6), StepCost(0.0, 2e-6), StepCost(0.003, 1e-6, ((0.0, 1.0), (0.7, 2.0)))]
+)
 def test_the_plan_fills_the_time_with_the_given_ratio_of_steps(cost, start):
     plan = plan_training(120.0, cost, start, MANY)
     assert plan.iterations / plan.max_primitives == pytest.approx(STEPS_PER_PRIMITIVE, rel=2e-3)

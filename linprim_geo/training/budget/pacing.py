@@ -13,7 +13,7 @@ import torch
 
 from linprim_geo.base.budget import AIM, Budget
 from linprim_geo.base.errors import LinprimError
-from linprim_geo.base.options import TrainOptions
+from linprim_geo.base.options import GEOMETRY_WEIGHTS, TrainOptions
 from linprim_geo.base.progress import Progress
 from linprim_geo.runs.run import Run
 from linprim_geo.training.budget.plan import (
@@ -83,15 +83,16 @@ class Pace:
         finish = self.finish - SAVE_SECONDS + saving
         since, then = self.mark if self.mark and self.mark[0] < trainer.step else (0, self.budget.began)
         per_step = (begin - then) / (trainer.step - since)
-        # Terms that start only after this step are included by the factor measured in the calibration.
-        late = 1 + (self.record["cost"]["late"] - 1) * self.record["cost"]["late_share"] / (1 - GROWTH_END)
-        last = corrected_steps(trainer.step, planned, per_step * late, self.budget.left() - finish)
+        # Later phases cost more, by the ratio measured in the calibration.
+        cost = StepCost(1.0, 0.0, self.record["cost"].get("phases", StepCost.phases))
+        per_step *= cost.mean(GROWTH_END, 1.0) / cost.mean(since / planned, GROWTH_END)
+        last = corrected_steps(trainer.step, planned, per_step, self.budget.left() - finish)
         self.record["correction"] = {
             "step": trainer.step,
             "iterations": last,
             "planned": planned,
             "elapsed_seconds": self.budget.elapsed(),
-            "step_seconds": per_step * late,
+            "step_seconds": per_step,
         }
         run.note("time_budget", self.record)
         trainer.correction = (trainer.step, last)
@@ -193,7 +194,7 @@ def calibrate(
     and seconds to score a view.
 
     Two temporary trainers take steps in turn. They are set to the end of growth, where all spherical harmonics degrees
-    are in use.
+    are in use. The larger one also takes steps in the other phases of a run, at the end of each.
     """
     options = replace(options, iterations=TrainOptions.iterations)
     begin = time.monotonic()
@@ -218,29 +219,39 @@ def calibrate(
         environment=environment,
     )
     large.terms = terms
-    late_from = min(
-        options.geometry_from if terms else 1.0, options.order_from if options.order_from > GROWTH_END else 1.0
-    )
     until = time.monotonic() + CALIBRATION_SHARE * budget.seconds
-    times: dict[str, list[float]] = {"small": [], "large": [], "late": []}
-    kinds = [("small", small, GROWTH_END), ("large", large, GROWTH_END)]
-    if late_from < 1:
-        kinds.append(("late", large, max(late_from, GROWTH_END) + 0.01))
+    starts = _phases(large)
+    growing = [start for start in starts if start <= GROWTH_END][-1]
+    grown, timed = round(GROWTH_END * options.iterations) + 1, CALIBRATION_WARM_UP + CALIBRATION_STEPS + 1
+    # The trainer and the first step of each kind of steps. Phases other than that at the end of growth are named by
+    # their start, and timed before their end.
+    steps: dict[object, tuple[Trainer, int]] = {"small": (small, grown), growing: (large, grown)}
+    for start, end in zip(starts, [*starts[1:], 1.0], strict=True):
+        steps.setdefault(start, (large, max(0, round(end * options.iterations) - timed)))
+    times: dict[object, list[float]] = {kind: [] for kind in steps}
     for turn in range(CALIBRATION_WARM_UP + CALIBRATION_STEPS):
         if turn > CALIBRATION_WARM_UP + 2 and time.monotonic() > until:
             break
-        for name, trainer, at in kinds:
-            trainer.step = round(at * options.iterations) + 1 + turn
+        for kind, (trainer, first) in steps.items():
+            trainer.step = first + turn
             trainer.seconds = 0.0
             trainer.advance()
             if turn >= CALIBRATION_WARM_UP:
-                times[name].append(trainer.seconds)
-    mean = {name: float(np.mean(values)) for name, values in times.items() if values}
+                times[kind].append(trainer.seconds)
+    mean = {kind: float(np.mean(values)) for kind, values in times.items()}
     begin = time.monotonic()
     score(large, images[:2])
     view_seconds = (time.monotonic() - begin) / len(images[:2])
-    late = mean.get("late", mean["large"]) / mean["large"]
-    cost = StepCost.fit(
-        (part, mean["small"]), (len(large), mean["large"]), late, 1 - late_from if late_from < 1 else 0.0
-    )
+    phases = [(start, mean[start] / mean[growing]) for start in starts]
+    cost = StepCost.fit((part, mean["small"]), (len(large), mean[growing]), phases)
     return cost, begun, starting, view_seconds
+
+
+def _phases(trainer: Trainer) -> list[float]:
+    """Return the shares of a run at which its steps change their cost, from 0 on: sizes of photographs, late terms of
+    the loss, and the order of blending."""
+    options = trainer.options
+    starts = {start for start, _ in trainer.coarse.phases()}
+    starts |= {options.order_from if options.order != "center" else 0.0}
+    starts |= {options.geometry_from if any(getattr(options, name) > 0 for name in GEOMETRY_WEIGHTS) else 0.0}
+    return sorted(start for start in starts if start < 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 # Steps per primitive of a freely planned run. Best of four at equal time on the built-in part (40 views of 128 px, 20 s
@@ -23,32 +24,42 @@ SAVE_SECONDS = 0.3
 
 @dataclass(frozen=True)
 class StepCost:
-    """Seconds of one training step: `base` + `per_primitive` times the number of primitives.
+    """Seconds of one training step: `base` + `per_primitive` times the number of primitives, times what its phase of
+    the run costs.
 
-    In the last share `late_share` of the run, which has more loss terms or a more expensive blending order, a step
-    takes `late` times as long.
+    `phases` holds (share of the run from which on a phase lasts, relative cost of its steps), in order from share 0.
+    Phases differ in the size of photographs, the terms of the loss and the order of blending.
     """
 
     base: float
     per_primitive: float
-    late: float = 1.0
-    late_share: float = 0.0
+    phases: Sequence[Sequence[float]] = ((0.0, 1.0),)
 
     @staticmethod
-    def fit(small: tuple[int, float], large: tuple[int, float], late: float = 1.0, late_share: float = 0.0) -> StepCost:
+    def fit(
+        small: tuple[int, float], large: tuple[int, float], phases: Sequence[Sequence[float]] = ((0.0, 1.0),)
+    ) -> StepCost:
         """Fit the line through two measurements (primitives, seconds). If the larger population was not slower, a step
         costs their mean for any number of primitives."""
         (n, s), (m, t) = small, large
         slope = (t - s) / (m - n) if m > n else 0.0
         if slope <= 0:
-            return StepCost((s + t) / 2, 0.0, late, late_share)
+            return StepCost((s + t) / 2, 0.0, phases)
         if slope * n > s:  # the line would have a negative base: use a line through zero
-            return StepCost(0.0, t / m, late, late_share)
-        return StepCost(s - slope * n, slope, late, late_share)
+            return StepCost(0.0, t / m, phases)
+        return StepCost(s - slope * n, slope, phases)
 
     def seconds(self, primitives: float) -> float:
         """Return the seconds of a step, averaged over the run."""
-        return (self.base + self.per_primitive * primitives) * (1 + self.late_share * (self.late - 1))
+        return (self.base + self.per_primitive * primitives) * self.mean()
+
+    def mean(self, begin: float = 0.0, end: float = 1.0) -> float:
+        """Return the mean relative cost of the steps between two different shares of the run."""
+        ends = [*[share for share, _ in self.phases[1:]], 1.0]
+        total = 0.0
+        for (first, relative), last in zip(self.phases, ends, strict=True):
+            total += relative * max(0.0, min(last, end) - max(first, begin))
+        return total / (end - begin)
 
 
 @dataclass(frozen=True)
@@ -93,8 +104,7 @@ def plan_training(
     if seconds <= 0:
         return None
     share = mean_population(start)
-    factor = cost.seconds(0) / cost.base if cost.base > 0 else 1 + cost.late_share * (cost.late - 1)
-    a, b = cost.base * factor, cost.per_primitive * factor * share
+    a, b = cost.base * cost.mean(), cost.per_primitive * cost.mean() * share
     least = max(1, min(LEAST_PRIMITIVES, most))
     if max_primitives is not None:
         cap, why = max_primitives, "the given limit of primitives"

@@ -64,9 +64,12 @@ class GeometryTerms:
             weights["stereo_depth"] = STEREO_EVERY * self.options.stereo_depth
         return {name: weight for name, weight in weights.items() if weight > 0}
 
-    def loss(self, weights: dict[str, float], out: Rendering, index: int, step: int, raw_opacity: Tensor) -> Tensor:
+    def loss(
+        self, weights: dict[str, float], out: Rendering, index: int, step: int, raw_opacity: Tensor, factor: int = 1
+    ) -> Tensor:
         """Return the scalar sum of the terms in `weights`. `out` is the rendering of view `index`, with geometry if
-        `needs_geometry`."""
+        `needs_geometry`, at 1/`factor` of its width and height; only stereo supervision allows a factor other than 1.
+        """
         image, evidence = self.images[index], self.evidence[index]
         total = raw_opacity.new_zeros(())
         for name, weight in weights.items():
@@ -78,9 +81,10 @@ class GeometryTerms:
                 assert out.distortion is not None
                 term = out.distortion.mean()
             elif name == "stereo_depth":
-                offset = np.random.default_rng([self.options.seed, 9, step]).integers(evidence.factor, size=2)
+                stride = max(1, evidence.factor // factor)
+                offset = np.random.default_rng([self.options.seed, 9, step]).integers(stride, size=2)
                 assert evidence.planes is not None
-                term = plane_error(_geometry(out)[0], evidence.planes, evidence.factor, *offset)
+                term = plane_error(_geometry(out)[0], evidence.planes, evidence.factor / factor, stride, *offset)
             elif name == "sensor_depth" and evidence.depth is not None:
                 term = depth_error(_geometry(out)[0], evidence.depth)
             elif name == "sensor_normals" and evidence.normal is not None:
@@ -204,25 +208,35 @@ def depth_error(depth: Tensor, wanted: Tensor, weight: Tensor | None = None) -> 
     return (error * weight).sum() / weight.sum().clamp_min(1e-6)
 
 
-def plane_error(depth: Tensor, planes: Tensor, factor: int, column: int, row: int) -> Tensor:
+def plane_error(depth: Tensor, planes: Tensor, scale: float, stride: int, column: int, row: int) -> Tensor:
     """Return the mean amount by which |depth - wanted| / wanted exceeds CONFIRMED_DEPTH, capped at DEPTH_CAP, over
     pixels where both exist.
 
     Stereo is not more accurate than CONFIRMED_DEPTH; within that, the photographs decide.
 
     Args:
-        depth: (H, W).
-        planes: (3, h, w), see `Evidence`. Each of its pixels covers `factor` by `factor` pixels of `depth`; it is
-            compared with the one in this `column` and `row` of them.
+        depth: (H, W). Every `stride`-th pixel of every `stride`-th row is compared, from this `column` and `row` on.
+        planes: (3, h, w), see `Evidence`. Each of its pixels covers `scale` by `scale` pixels of `depth`.
     """
-    _, height, width = planes.shape
-    inverse, right, down = planes
-    across, along = ((place + 0.5) / factor - 0.5 for place in (column, row))
-    there = inverse + across * right + along * down
-    found = depth[row : row + factor * height : factor, column : column + factor * width : factor]
+    (height, width), (rows, columns) = planes.shape[1:], depth.shape
+    i, along = _in_planes(row, rows, stride, scale, height)
+    j, across = _in_planes(column, columns, stride, scale, width)
+    inverse, right, down = planes[:, i[:, None], j]
+    there = inverse + across.to(planes.dtype) * right + along.to(planes.dtype)[:, None] * down
+    found = depth[row::stride, column::stride][: len(i), : len(j)]
     some = (inverse > 0) & (there > 0) & (found > 0)
     error = ((found * there - 1).abs() - CONFIRMED_DEPTH).clamp(0, DEPTH_CAP) * some
     return error.sum() / some.sum().clamp_min(1)
+
+
+def _in_planes(first: int, count: int, stride: int, scale: float, size: int) -> tuple[Tensor, Tensor]:
+    """Return, for every `stride`-th of `count` pixels from `first` on, the one of `size` pixels of a map of planes that
+    covers it, and its position relative to the centre of that, in pixels of the map. Pixels beyond the map are left
+    out."""
+    place = (np.arange(first, count, stride) + 0.5) / scale
+    index = np.floor(place).astype(np.int64)
+    inside = index < size
+    return torch.from_numpy(index[inside]), torch.from_numpy((place - 0.5 - index)[inside])
 
 
 def normal_error(normal: Tensor, wanted: Tensor, opacity: Tensor) -> Tensor:

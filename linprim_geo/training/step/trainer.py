@@ -25,6 +25,7 @@ from linprim_geo.geometry.view_support import Support
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.adam import adam_rows, adam_step
 from linprim_geo.points.far_colors import SURVEY_VIEWS
+from linprim_geo.training.step.coarse_images import CoarseImages
 from linprim_geo.training.step.dropout import with_dropout
 from linprim_geo.training.step.environment import contradiction, seen_through
 from linprim_geo.training.step.exposure import Exposure, exposed
@@ -102,6 +103,7 @@ class Trainer:
         """`log_gain` (V, 3): initial log gains of the photographs, for `--exposure gain`. `environment` (6, S, S, 3):
         initial texels of an environment map that replaces the background."""
         self.images, self.options, self.bounds, self.terms = images, options, bounds, terms
+        self.coarse = CoarseImages(images, options)
         self.parameters = dict(parameters)
         self.fitted, self.random_background = fitted, random_background
         self.background = background
@@ -191,7 +193,8 @@ class Trainer:
         """
         begin = time.perf_counter()
         index = self.view_of(self.step)
-        image = self.images[index]
+        factor = self.coarse.factor(self.part())
+        image = self.coarse.image(index, factor)
         background = self.background
         if self.fitted:
             background = self.parameters["background"]
@@ -240,7 +243,7 @@ class Trainer:
             geometry = out
             if needed and not shared:
                 geometry = _single(ops.rasterize(*active, behind, image.camera, geometry=True, **how))
-            objective = objective + self.terms.loss(weights, geometry, index, self.step, leaves["raw_opacity"])
+            objective = objective + self.terms.loss(weights, geometry, index, self.step, leaves["raw_opacity"], factor)
         wanted = [*leaves.values(), screen] + ([] if log_gain is None else [log_gain])
         grads = torch.autograd.grad(objective, wanted, allow_unused=True)
         screen_grad = grads[len(leaves)].float()[: len(self)]
