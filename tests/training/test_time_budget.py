@@ -34,7 +34,9 @@ from linprim_geo.training.budget.plan import (
     mean_population,
     plan_training,
 )
+from linprim_geo.training.loop import evaluate
 from linprim_geo.training.start import start_trainer
+from linprim_geo.training.step import coarse_images
 from linprim_geo.training.step.trainer import Trainer
 from linprim_geo.training.step.training_images import load_training_images
 from linprim_geo.training.train import train
@@ -146,6 +148,31 @@ def test_a_correction_stretches_the_remaining_schedule(trainer):
         assert trainer.iterations == last and trainer.has_reached(0.7) == (trainer.part() >= 0.7)
     assert parts[0] == bend / planned and parts[-1] == pytest.approx(1)
     assert np.diff(parts) == pytest.approx(np.full(last - bend, (1 - bend / planned) / (last - bend)))
+
+
+def test_the_cost_of_each_phase_is_measured(tiny_run, monkeypatch):
+    """Steps take time in proportion to pixels, and three times as much with overlap."""
+    monkeypatch.setattr(coarse_images, "coarsest_factor", lambda *_: 4)
+
+    def advance(self):
+        factor, overlap = self.coarse.factor(self.part()), self.raster_options_now()["order"] == "overlap"
+        self.seconds += len(self) / factor**2 * (3 if overlap else 1)
+        self.step += 1
+
+    monkeypatch.setattr(Trainer, "advance", advance)
+    run = Run.open(tiny_run)
+    images = load_training_images(run.scene().train, run.similarity)
+    options = replace(run.train_options, order="overlap", order_from=0.7, max_primitives=100)
+    cost, *_ = pacing.calibrate(
+        options,
+        images,
+        None,
+        Budget(60.0),
+        lambda given: start_trainer(run.scene(), run, images, given, None),
+        evaluate,
+    )
+    assert cost.phases == [(0.0, 1 / 4), (0.4, 1.0), (0.7, 3.0), (0.8, 12.0)]
+    assert cost.mean() == pytest.approx(0.1 + 0.3 + 0.3 + 2.4)
 
 
 # --- whole runs ------------------------------------------------------------------------------------------
