@@ -113,17 +113,23 @@ def test_a_coarse_run_resumes_bit_for_bit_and_ends_on_whole_photographs(tiny_sce
     assert np.array_equal(first.center, second.center) and np.array_equal(first.sh, second.sh)
 
 
-def test_a_coarse_step_follows_the_gradient_of_the_averaged_photograph(tiny_run, monkeypatch):
-    """A step on images averaged down by two is that of a trainer whose images are the averaged ones."""
+@pytest.mark.parametrize("environment", [False, True])
+def test_a_coarse_step_is_that_of_averaged_photographs(environment, tiny_run):
+    """Trainers whose images are averaged down by two beforehand, and in the step."""
     run = Run.open(tiny_run)
     images = load_training_images(run.scene().train, run.similarity)
     options = replace(run.train_options, coarse="off")
-    small = start_trainer(run.scene(), run, [averaged_down(each, 2) for each in images], options, None)
-    coarse = start_trainer(run.scene(), run, images, options, None)
-    coarse.bounds = coarse.control.bounds = small.bounds
-    coarse.parameters = {name: value.clone() for name, value in small.parameters.items()}
+    started = start_trainer(run.scene(), run, images, options, None)
+
+    def trainer(images: list[TrainingImage]) -> Trainer:
+        parameters = {name: value.clone() for name, value in started.parameters.items()}
+        texels = torch.full((6, 4, 4, 3), 0.5) if environment else None
+        return Trainer(images, parameters, options, started.bounds, torch.zeros(3), False, False, environment=texels)
+
+    small, coarse = trainer([averaged_down(each, 2) for each in images]), trainer(images)
     coarse.coarse.coarsest = 2
-    for trainer in (small, coarse):
-        trainer.advance()
+    for each in (small, coarse):
+        each.advance()
     assert coarse.loss == small.loss
     assert all(torch.equal(coarse.parameters[name], small.parameters[name]) for name in small.parameters)
+    assert ("environment" in small.parameters) == environment

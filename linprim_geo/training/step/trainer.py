@@ -251,7 +251,7 @@ class Trainer:
             if self.exposure is not None:
                 self.exposure.update(index, grads[-1], self.part())
             grads = grads[: len(leaves)]
-            self._update(dict(zip(leaves, grads, strict=True)))
+            self._update(dict(zip(leaves, grads, strict=True)), factor)
             self.control.add_noise(self.parameters, self.step + 1)
             self.control.accumulate(self.parameters, image.camera, image.size, screen_grad)
         self.step += 1
@@ -273,7 +273,8 @@ class Trainer:
         self.loss = loss if first else 0.98 * self.loss + 0.02 * loss
         self.psnr = psnr if first else 0.98 * self.psnr + 0.02 * psnr
 
-    def _update(self, grads: dict[str, torch.Tensor | None]) -> None:
+    def _update(self, grads: dict[str, torch.Tensor | None], factor: int) -> None:
+        """Take a step of the optimiser. `grads` are of a photograph averaged down by `factor`."""
         part = self.part()
         rates = {name: rate * final**part for name, (rate, final) in RATES.items()}
         wanted = {name: grad for name in self.parameters if (grad := grads[name]) is not None}
@@ -299,7 +300,7 @@ class Trainer:
                 self.second[name],
                 rates[name],
                 self.step + 1,
-                epsilon=self.faint if name == "environment" else ADAM_EPSILON,
+                epsilon=self.faint * factor**2 if name == "environment" else ADAM_EPSILON,
             )
         rotation = self.parameters["rotation"]
         rotation /= torch.linalg.vector_norm(rotation, dim=1, keepdim=True).clamp_min(1e-12)
