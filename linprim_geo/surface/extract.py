@@ -129,17 +129,13 @@ def opened_with(
         raise LinprimError(f"--method is {method!r}, wanted {' or '.join(METHODS)}")
     check(options)
     if budget and method != "tsdf":
-        raise LinprimError(
-            f"--time-budget chooses a voxel size, which --method {method} has none of: wanted --method tsdf"
-        )
+        raise LinprimError(f"--time-budget is for --method tsdf, not for {method}")
     if budget and options.voxel_size > 0:
         raise LinprimError("--time-budget chooses the voxel size: wanted one of it and --voxel-size")
     if blocks < 1:
         raise LinprimError(f"--blocks is {blocks}, wanted a number from 1")
     if blocks > 1 and method != "tsdf":
-        raise LinprimError(
-            f"--blocks fuses depth maps in parts, which --method {method} has none of: wanted --method tsdf"
-        )
+        raise LinprimError(f"--blocks is for --method tsdf, not for {method}")
     for name, methods in METHODS_WITH.items():
         if method not in methods and getattr(options, name) != getattr(ExtractOptions(), name):
             raise LinprimError(f"--{name.replace('_', '-')} is for --method {' or '.join(methods)}, not for {method}")

@@ -322,7 +322,7 @@ def test_a_budget_without_free_options_is_refused(tiny_scene, tiny_run, tmp_path
         )
     with pytest.raises(LinprimError, match="--voxel-size"):
         extract_mesh(tiny_run, options=ExtractOptions(voxel_size=0.1), time_budget=5.0, quiet=True)
-    with pytest.raises(LinprimError, match="--method polyhedra has none"):
+    with pytest.raises(LinprimError, match="--time-budget is for --method tsdf, not for polyhedra"):
         extract_mesh(tiny_run, "polyhedra", time_budget=5.0, quiet=True)
 
 

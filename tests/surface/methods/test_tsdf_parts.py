@@ -144,7 +144,7 @@ def test_finished_parts_are_reused_and_those_of_other_options_removed(run_copy, 
         ({"blocks": 0}, "--blocks is 0"),
         (
             {"blocks": 2, "method": "polyhedra"},
-            "--blocks fuses depth maps in parts, which --method polyhedra has none of",
+            "--blocks is for --method tsdf, not for polyhedra",
         ),
         ({"blocks": 2, "options": ExtractOptions(level=LEVEL, voxel_size=1e-5)}, "voxel size 1e-05 is less than"),
     ],
