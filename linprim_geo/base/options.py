@@ -247,7 +247,8 @@ class TrainOptions:
     coarse: str = option(
         "auto",
         "auto: average photographs down by 2, 4, ... in the first 80 % of the steps, as far as 2 pixels for each "
-        "primitive and 200 along the longer side are left; saves up to half of the time. off: full size in all steps",
+        "primitive and 200 along the longer side are left; saves a quarter to two thirds of the time. off: full "
+        "size in all steps",
         choices=("auto", "off"),
     )
     primitive: str = option("octahedron", "kind of primitive", choices=tuple(KINDS))
