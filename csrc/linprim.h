@@ -22,7 +22,7 @@ const char* instruction_set();
 struct Statistics {
   int64_t primitives, visible, pairs, visited_lanes, hit_lanes, working_set_bytes;
   double project_ms, sort_ms, bin_ms, forward_ms, backward_ms,
-      chain_ms;  // project: with the search for the tiles, bin: without
+      project_backward_ms;  // project: with the search for the tiles, bin: without
 };
 Statistics statistics();
 

@@ -147,7 +147,7 @@ def measure(
         for name, value in ops.machine_limits().items():
             limits.setdefault(name, []).append(value)
         stats = ops.statistics()
-        for stage in ("project", "sort", "bin", "forward", "backward", "chain"):
+        for stage in ("project", "sort", "bin", "forward", "backward", "project_backward"):
             note(stage, stats[f"{stage}_ms"])
         for name, a, b in (
             ("call_forward", 0, 1),
@@ -173,7 +173,7 @@ def measure(
         "visited_per_hit": stats["visited_lanes"] / hits,
         "pairs_per_tile": stats["pairs"] / (-(-width // 16) * -(-height // 16)),
         "forward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("project", "sort", "bin", "forward")) / hits,
-        "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "chain")) / hits,
+        "backward_ns_per_hit": 1e6 * sum(stages[s]["median"] for s in ("backward", "project_backward")) / hits,
         "raster_forward_ns_per_hit": 1e6 * stages["forward"]["median"] / hits,
         "raster_backward_ns_per_hit": 1e6 * stages["backward"]["median"] / hits,
         "limit_forward_ns": limit["pair_forward_ns"]["median"],

@@ -36,7 +36,7 @@ NB_MODULE(_core, m) {
     d["primitives"] = s.primitives, d["visible"] = s.visible, d["pairs"] = s.pairs;
     d["visited_lanes"] = s.visited_lanes, d["hit_lanes"] = s.hit_lanes, d["working_set_bytes"] = s.working_set_bytes;
     d["project_ms"] = s.project_ms, d["sort_ms"] = s.sort_ms, d["bin_ms"] = s.bin_ms, d["forward_ms"] = s.forward_ms;
-    d["backward_ms"] = s.backward_ms, d["chain_ms"] = s.chain_ms;
+    d["backward_ms"] = s.backward_ms, d["project_backward_ms"] = s.project_backward_ms;
     return d;
   });
 }

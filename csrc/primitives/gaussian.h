@@ -198,7 +198,7 @@ void project_gaussians(const ProjectParams<Real>& P, int64_t begin, int64_t end)
 }
 
 template <class Real>
-void chain_gaussians(const ChainParams<Real>& P, int64_t begin, int64_t end) {
+void project_gaussians_backward(const ProjectBackwardParams<Real>& P, int64_t begin, int64_t end) {
   const View& view = P.view;
   const Eye eye(view);
   const bool geometry = P.sums_per_slot == kGeometrySums;

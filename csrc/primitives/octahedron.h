@@ -276,7 +276,7 @@ void project_octahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end)
 }
 
 template <class Real, RayModel kRays>
-void chain_octahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
+void project_octahedra_backward(const ProjectBackwardParams<Real>& P, int64_t begin, int64_t end) {
   const View& view = P.view;
   const Eye eye(view);
   const bool geometry = P.sums_per_slot == kGeometrySums;

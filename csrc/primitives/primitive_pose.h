@@ -236,7 +236,7 @@ inline void zero_row(const PrimitiveGradients<Real>& out, int64_t row, int exten
 // Sums the gradient slots of each lane's primitive; rows without a slot are written as zero. Returns whether any lane
 // has one.
 template <class Real>
-inline bool gather_sums(const ChainParams<Real>& P, int64_t first, int lanes, double (*sums)[kGeometrySums]) {
+inline bool gather_sums(const ProjectBackwardParams<Real>& P, int64_t first, int lanes, double (*sums)[kGeometrySums]) {
   bool found = false;
   for (int l = 0; l < lanes; ++l) {
     const uint32_t count = P.slot_count[first + l];
@@ -257,7 +257,7 @@ inline Real saturated(double x) {
   return Real(std::clamp(x, -kMost, kMost));
 }
 
-// Gradients in camera space, which the chain functions convert and write to the rows of the visible lanes.
+// Gradients in camera space, which the backward functions convert and write to the rows of the visible lanes.
 struct RowGradients {
   D center[3];   // camera space
   D axis[3][3];  // of the unit axes, camera space
@@ -266,8 +266,8 @@ struct RowGradients {
   D screen_x, screen_y;  // of the projected centre, pixels
 };
 template <class Real>
-inline void write_rows(const ChainParams<Real>& P, const Eye& eye, const Pose& f, const RowGradients& g, int64_t first,
-                       int lanes, const double (*sums)[kGeometrySums], const double* pull) {
+inline void write_rows(const ProjectBackwardParams<Real>& P, const Eye& eye, const Pose& f, const RowGradients& g,
+                       int64_t first, int lanes, const double (*sums)[kGeometrySums], const double* pull) {
   const double* w = P.view.world_to_camera;
   const int extents = P.primitives.extents(), sh_count = P.primitives.sh_count;
   D q_grad[4], world[3];

@@ -206,7 +206,7 @@ void project_tetrahedra(const ProjectParams<Real>& P, int64_t begin, int64_t end
 }
 
 template <class Real, RayModel kRays>
-void chain_tetrahedra(const ChainParams<Real>& P, int64_t begin, int64_t end) {
+void project_tetrahedra_backward(const ProjectBackwardParams<Real>& P, int64_t begin, int64_t end) {
   const View& view = P.view;
   const Eye eye(view);
   const bool geometry = P.sums_per_slot == kGeometrySums;

@@ -31,7 +31,7 @@ struct ProjectParams {
 };
 
 template <class Real>
-struct ChainParams {
+struct ProjectBackwardParams {
   View view;
   Primitives<Real> primitives;
   const Footprint* footprints;
@@ -116,7 +116,7 @@ template <class Real>
 struct SolidKernels {
   int64_t record_bytes;
   void (*project)(const ProjectParams<Real>&, int64_t begin, int64_t end);
-  void (*chain)(const ChainParams<Real>&, int64_t begin, int64_t end);
+  void (*project_backward)(const ProjectBackwardParams<Real>&, int64_t begin, int64_t end);
   // By order and set of outputs (colour; colour and geometry); null if the kind does not support the order. `scratch`
   // belongs to the calling thread: scratch_bytes(longest tile list) bytes, 64-byte aligned.
   Counts (*forward[kOrders][2])(const RasterParams<Real>&, int tile, void* scratch);

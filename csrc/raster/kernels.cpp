@@ -47,13 +47,12 @@ int64_t scratch_bytes(Order order, bool geometry, int64_t longest_list) {
 // Fills the kernel table of one primitive kind under one ray model. First index of `forward` and `backward`: centre,
 // entry, overlap order.
 template <class Kind>
-constexpr SolidKernels<typename Kind::Real> solid_kernels(void (*project)(const ProjectParams<typename Kind::Real>&,
-                                                                          int64_t, int64_t),
-                                                          void (*chain)(const ChainParams<typename Kind::Real>&,
-                                                                        int64_t, int64_t)) {
+constexpr SolidKernels<typename Kind::Real> solid_kernels(
+    void (*project)(const ProjectParams<typename Kind::Real>&, int64_t, int64_t),
+    void (*project_backward)(const ProjectBackwardParams<typename Kind::Real>&, int64_t, int64_t)) {
   SolidKernels<typename Kind::Real> k{};
   k.record_bytes = sizeof(typename Kind::Record);
-  k.project = project, k.chain = chain;
+  k.project = project, k.project_backward = project_backward;
   k.forward[0][0] = forward_center<Kind, false>, k.forward[0][1] = forward_center<Kind, true>;
   k.backward[0][0] = backward_center<Kind, false>, k.backward[0][1] = backward_center<Kind, true>;
   k.scratch_bytes = scratch_bytes<Kind>;
@@ -76,16 +75,16 @@ constexpr Kernels<Real> all_kernels(const char* name) {
   Kernels<Real> k{};
   k.name = name, k.width = kWidth, k.bin = bin<kWidth>;
   // One row per kind, in the order of PrimitiveKind; one column per ray model.
-  k.solids[0][0] =
-      solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>, chain_octahedra<Real, kExact>);
+  k.solids[0][0] = solid_kernels<Octahedron<Real, kWidth, kExact>>(project_octahedra<Real, kExact>,
+                                                                   project_octahedra_backward<Real, kExact>);
   k.solids[0][1] = solid_kernels<Octahedron<Real, kWidth, kAffine>>(project_octahedra<Real, kAffine>,
-                                                                    chain_octahedra<Real, kAffine>);
+                                                                    project_octahedra_backward<Real, kAffine>);
   k.solids[1][0] = solid_kernels<Tetrahedron<Real, kWidth, kExact>>(project_tetrahedra<Real, kExact>,
-                                                                    chain_tetrahedra<Real, kExact>);
+                                                                    project_tetrahedra_backward<Real, kExact>);
   k.solids[1][1] = solid_kernels<Tetrahedron<Real, kWidth, kAffine>>(project_tetrahedra<Real, kAffine>,
-                                                                     chain_tetrahedra<Real, kAffine>);
+                                                                     project_tetrahedra_backward<Real, kAffine>);
   k.solids[2][0] = k.solids[2][1] =
-      solid_kernels<Gaussian<Real, kWidth, kAffine>>(project_gaussians<Real>, chain_gaussians<Real>);
+      solid_kernels<Gaussian<Real, kWidth, kAffine>>(project_gaussians<Real>, project_gaussians_backward<Real>);
   return k;
 }
 

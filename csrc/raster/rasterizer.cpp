@@ -387,20 +387,20 @@ void rasterize_grad(const View& view, const Primitives<Real>& primitives, const 
     for (int k = 0; k < 3; ++k) total[k] += double(frame->background_sums[3 * tile + k]);
   for (int k = 0; k < 3; ++k) background_grad[k] = Real(total[k]);
   stats.backward_ms = watch.lap();
-  const ChainParams<Real> chain{view,
-                                primitives,
-                                frame->footprints.data(),
-                                color,
-                                frame->first_slot.data(),
-                                frame->slot_count.data(),
-                                frame->sums.data(),
-                                per_slot,
-                                gradients};
+  const ProjectBackwardParams<Real> backward{view,
+                                             primitives,
+                                             frame->footprints.data(),
+                                             color,
+                                             frame->first_slot.data(),
+                                             frame->slot_count.data(),
+                                             frame->sums.data(),
+                                             per_slot,
+                                             gradients};
   parallel_for((primitives.n + kPrimitivesPerTask - 1) / kPrimitivesPerTask, [&](int64_t task, int) {
     const int64_t begin = task * kPrimitivesPerTask;
-    frame->solid->chain(chain, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
+    frame->solid->project_backward(backward, begin, std::min(primitives.n, begin + kPrimitivesPerTask));
   });
-  stats.chain_ms = watch.lap();
+  stats.project_backward_ms = watch.lap();
   last_statistics = stats;
 }
 
