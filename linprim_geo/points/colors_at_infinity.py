@@ -46,7 +46,7 @@ STRIDE, PATCH = 4, 3
 TEXTURED = 12.0
 
 
-class FarColors:
+class ColorsAtInfinity:
     """The colours that photographs show in each direction, as if everything were at infinity.
 
     `texels` (T, 3) float32, 0 to 255, with T = 6 size^2: the colour that most photographs of a direction agree on, NaN
@@ -127,9 +127,9 @@ class FarColors:
         return fine.movedim(1, -1).contiguous()
 
 
-def far_colors(scene: Scene) -> FarColors:
+def colors_at_infinity(scene: Scene) -> ColorsAtInfinity:
     """Return the colours that the photographs of a scene show at infinity."""
-    return FarColors(evenly_spread_views(scene.train, SURVEY_VIEWS))
+    return ColorsAtInfinity(evenly_spread_views(scene.train, SURVEY_VIEWS))
 
 
 def far_share(scene: Scene, observations: Observations | None) -> float:
@@ -154,8 +154,8 @@ def far_share(scene: Scene, observations: Observations | None) -> float:
     share, known = _explained_by_halves(looks)
     if known >= LEAST_TEXTURED:
         return share - _explained_by_halves(turned)[0]
-    share, known = _explained([(FarColors(looks), looks)], LEAST_VIEWS)
-    by_chance = _explained([(FarColors(turned), turned)], LEAST_VIEWS)[0]
+    share, known = _explained([(ColorsAtInfinity(looks), looks)], LEAST_VIEWS)
+    by_chance = _explained([(ColorsAtInfinity(turned), turned)], LEAST_VIEWS)[0]
     return BY_ITSELF * (share - by_chance) if known >= LEAST_TEXTURED else 0.0
 
 
@@ -194,10 +194,12 @@ def _explained_by_halves(small_views: Sequence[SmallView]) -> tuple[float, float
     halves = small_views[::2], small_views[1::2]
     if not all(halves):
         return 0.0, 0.0
-    return _explained([(FarColors(halves[1]), halves[0]), (FarColors(halves[0]), halves[1])], LEAST_OTHERS)
+    return _explained(
+        [(ColorsAtInfinity(halves[1]), halves[0]), (ColorsAtInfinity(halves[0]), halves[1])], LEAST_OTHERS
+    )
 
 
-def _explained(pairs: Sequence[tuple[FarColors, Sequence[SmallView]]], least: int) -> tuple[float, float]:
+def _explained(pairs: Sequence[tuple[ColorsAtInfinity, Sequence[SmallView]]], least: int) -> tuple[float, float]:
     """Compare views with the colours at infinity that they are paired with.
 
     Returns: the share of the textured patches that the colours explain, and the share of all patches that are textured

@@ -17,7 +17,7 @@ import numpy as np
 from linprim_geo.capture.types import PointCloud, Scene
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.geometry.sampling import sample_bilinear
-from linprim_geo.points.far_colors import FarColors
+from linprim_geo.points.colors_at_infinity import ColorsAtInfinity
 from linprim_geo.points.initial_points import SmallView, evenly_spread_views, in_image
 
 # Side of an image cell that should hold a point, as a share of the image's longer side. This makes about 1,400 cells in
@@ -62,7 +62,9 @@ _AT_ONCE = 64
 _BACKDROP = 25.5
 
 
-def fill_gaps(scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: FarColors | None = None) -> PointCloud:
+def fill_gaps(
+    scene: Scene, seed: int, backdrop: np.ndarray | None = None, far: ColorsAtInfinity | None = None
+) -> PointCloud:
     """Return the scene's points followed by new ones in the image cells of training views that contain none.
 
     In three rounds, views are visited in order of their number of points. Each empty cell gets a candidate at a random

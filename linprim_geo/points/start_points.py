@@ -10,7 +10,7 @@ import numpy as np
 from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.options import TrainOptions, initial_count
 from linprim_geo.capture.types import PointCloud, Scene
-from linprim_geo.points.far_colors import FarColors
+from linprim_geo.points.colors_at_infinity import ColorsAtInfinity
 from linprim_geo.points.fill_gaps import fill_gaps
 from linprim_geo.points.initial_points import (
     VolumePoints,
@@ -67,7 +67,7 @@ def filled_points(
     scene: Scene,
     seed: int,
     backdrop: np.ndarray | None,
-    far: FarColors | None = None,
+    far: ColorsAtInfinity | None = None,
     surfaces: PointCloud | None = None,
 ) -> PointCloud:
     """Return the scene's points and those on `surfaces`, with gaps filled by `fill_gaps`. Random points in a volume lie

@@ -9,7 +9,7 @@ import torch
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.capture.types import Scene
-from linprim_geo.points.far_colors import OPEN_SHARE, FarColors, far_colors, far_share
+from linprim_geo.points.colors_at_infinity import OPEN_SHARE, ColorsAtInfinity, colors_at_infinity, far_share
 from linprim_geo.points.initial_points import VolumePoints, in_image
 from linprim_geo.points.photo_evidence import observe
 from linprim_geo.training.step.training_images import TrainingImage
@@ -38,7 +38,7 @@ class Background:
     fitted: bool = False
     random: bool = False
     environment: bool = False
-    far: FarColors | None = None
+    far: ColorsAtInfinity | None = None
 
 
 def chosen_background(
@@ -74,7 +74,7 @@ def chosen_background(
     if text == "environment":
         if has_alpha:
             raise LinprimError("--background environment: masks or alpha say already what is background")
-        far = far_colors(scene) if begun is None else None
+        far = colors_at_infinity(scene) if begun is None else None
         return Background(torch.from_numpy(_mean_color(images)), environment=True, far=far)
     if text == "fitted":
         return Background(torch.from_numpy(np.median(_border_colors(images), 0).astype(np.float32)), fitted=True)

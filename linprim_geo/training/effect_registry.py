@@ -17,7 +17,7 @@ from linprim_geo.base.kinds import KINDS
 from linprim_geo.base.options import TrainOptions
 from linprim_geo.capture.types import Scene
 from linprim_geo.geometry.lens import largest_displacement
-from linprim_geo.points.far_colors import OPEN_SHARE, far_share
+from linprim_geo.points.colors_at_infinity import OPEN_SHARE, far_share
 from linprim_geo.points.initial_points import CAMERA_DISTANCE, VolumePoints, scene_normalization
 from linprim_geo.points.photo_evidence import Observations, observe
 from linprim_geo.points.start_points import initial_cloud

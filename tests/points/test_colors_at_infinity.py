@@ -10,7 +10,7 @@ from helpers.captures import look_at, transforms
 from PIL import Image
 
 from linprim_geo.capture.load import load_scene
-from linprim_geo.points.far_colors import OPEN_SHARE, far_share
+from linprim_geo.points.colors_at_infinity import OPEN_SHARE, far_share
 
 VIEWS, SIZE, FOCAL = 16, (160, 120), 120.0
 

@@ -94,7 +94,7 @@ LEFT = dict.fromkeys(("background", "environment"), {"background": "auto"})
 
 @pytest.fixture(autouse=True)
 def photographs(monkeypatch):
-    """Replace detectors of whole photographs, which are tested with `background` and `far_colors`."""
+    """Replace detectors of whole photographs, which are tested with `background` and `colors_at_infinity`."""
     shown: dict[str, float] = {}
     monkeypatch.setattr(effect_registry, "plain_border", lambda scene: shown["border"])
     monkeypatch.setattr(effect_registry, "far_share", lambda scene, observations: shown["far"])

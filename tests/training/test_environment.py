@@ -25,7 +25,7 @@ from linprim_geo.geometry.environment_map import (
 from linprim_geo.geometry.mesh_files import load_mesh
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.reference import rasterize as reference
-from linprim_geo.points.far_colors import SAME_COLOR
+from linprim_geo.points.colors_at_infinity import SAME_COLOR
 from linprim_geo.points.initial_points import in_image
 from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh

@@ -23,7 +23,7 @@ from linprim_geo.geometry.boxes import Block
 from linprim_geo.geometry.primitives import ARRAYS, Primitives, Tensors
 from linprim_geo.jobs import worker
 from linprim_geo.kernels import ops
-from linprim_geo.points.far_colors import far_colors
+from linprim_geo.points.colors_at_infinity import colors_at_infinity
 from linprim_geo.points.start_points import filled_points, initial_cloud
 from linprim_geo.runs.run import Run
 from linprim_geo.training.background import chosen_background
@@ -199,7 +199,7 @@ def _points_of(scene: Scene, run: Run, plan: Plan, number: int, options: TrainOp
     The block and its margin are limited separately: to the number of points from which a training of the block's own
     primitives would start, and of the remaining primitives of `options`.
     """
-    far = far_colors(scene) if plan.environment else None
+    far = colors_at_infinity(scene) if plan.environment else None
     backdrop = np.asarray(plan.shown) if plan.fitted else None
     surfaces = stereo_surfaces(scene, replace(options, stereo_depth=0.0), Progress("block", 1, quiet=True))
     cloud = filled_points(scene, options.seed, backdrop, far, surfaces.points)

@@ -8,7 +8,7 @@ import torch
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.kernels import ops
-from linprim_geo.points.far_colors import SAME_COLOR
+from linprim_geo.points.colors_at_infinity import SAME_COLOR
 
 # A texel counts as seen if its summed weight, transmittance times bilinear weight over the pixels of all views, exceeds
 # this (in pixels).

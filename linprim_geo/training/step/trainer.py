@@ -24,7 +24,7 @@ from linprim_geo.geometry.primitives import Primitives, Tensors
 from linprim_geo.geometry.view_support import Support
 from linprim_geo.kernels import ops
 from linprim_geo.kernels.adam import adam_rows, adam_step
-from linprim_geo.points.far_colors import SURVEY_VIEWS
+from linprim_geo.points.colors_at_infinity import SURVEY_VIEWS
 from linprim_geo.training.step.coarse_images import CoarseImages
 from linprim_geo.training.step.dropout import with_dropout
 from linprim_geo.training.step.environment import contradiction, seen_through
