@@ -232,11 +232,11 @@ def make_found_poses(folder: Path) -> None:
     (kept / "model").mkdir(parents=True)
     make_colmap(kept / "model", False)
     shutil.rmtree(kept / "model" / "old")
-    verdict = {"photographs": 3, "registered": 3, "points": 2, "error_px": 0.5, "track_length": 3.0}
-    (kept / "verdict.json").write_text(json.dumps(verdict))
+    summary = {"photographs": 3, "registered": 3, "points": 2, "error_px": 0.5, "track_length": 3.0}
+    (kept / "summary.json").write_text(json.dumps(summary))
 
 
-def read_verdict_file(file: Path) -> None:
+def read_summary_file(file: Path) -> None:
     cache = file.parents[2]
     check_scene(cache / "photos", cache)
 

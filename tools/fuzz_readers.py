@@ -86,7 +86,7 @@ READERS = (
         (("adjusted_poses.json", "json"),),
         captures.read_adjusted_poses_file,
     ),
-    Reader("found poses", captures.make_found_poses, (("**/verdict.json", "json"),), captures.read_verdict_file),
+    Reader("found poses", captures.make_found_poses, (("**/summary.json", "json"),), captures.read_summary_file),
     Reader(
         "colmap bin",
         lambda folder: captures.make_colmap(folder, False),

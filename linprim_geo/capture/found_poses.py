@@ -24,7 +24,7 @@ _PHOTO_FOLDERS = ("images", "image", "input", "rgb", ".")
 # Pillow's names of the formats that pycolmap reads. Photographs in other formats are converted into a temporary folder
 # beside the result.
 _FORMATS, _COPIES = ("JPEG", "MPO", "PNG", "TIFF", "BMP"), "copies"
-# Upper limit of plausible counts and pixels in a stored verdict.
+# Upper limit of plausible counts and pixels in a stored summary.
 _LARGEST = 1e12
 # Smallest share of photographs with poses that can be trained; below _GOOD_SHARE, or with worse values than the others,
 # a warning is given.
@@ -37,7 +37,7 @@ _LISTED = 6
 
 
 @dataclass(frozen=True)
-class Verdict:
+class PoseSummary:
     """Result of structure from motion.
 
     Number of photographs, number with a pose, number of points, mean reprojection error in pixels, mean number of
@@ -135,17 +135,17 @@ def found_model(root: Path, cache: Path | None = None) -> Path | None:
     if not names or not (base := _base(cache)).is_dir():
         return None
     kept = base / _key(folder, names)
-    verdict = _stored(kept)
-    if verdict is None:
+    summary = _stored(kept)
+    if summary is None:
         return None
-    _refuse(root, verdict)
+    _refuse(root, summary)
     return kept / "model"
 
 
-def _refuse(root: Path, verdict: Verdict) -> None:
-    if verdict.unusable:
+def _refuse(root: Path, summary: PoseSummary) -> None:
+    if summary.unusable:
         raise LinprimError(
-            f"{root}: poses were found for {verdict.registered} of {verdict.photographs} photographs, wanted at least"
+            f"{root}: poses were found for {summary.registered} of {summary.photographs} photographs, wanted at least"
             f" {MIN_REGISTERED} and half of them (do they overlap by two thirds, is there texture, did nothing move?)"
         )
 
@@ -167,17 +167,17 @@ def _key(folder: Path, names: Sequence[str]) -> str:
     return digest.hexdigest()
 
 
-def _stored(kept: Path) -> Verdict | None:
-    """Return the verdict stored in a folder, or None if there is none or it is unusable; it is then made again."""
+def _stored(kept: Path) -> PoseSummary | None:
+    """Return the summary stored in a folder, or None if there is none or it is unusable; it is then made again."""
     try:
-        verdict = Verdict(**json.loads((kept / "verdict.json").read_text(encoding="utf-8")))
-        *numbers, left_out, misplaced, refined = astuple(verdict)
+        summary = PoseSummary(**json.loads((kept / "summary.json").read_text(encoding="utf-8")))
+        *numbers, left_out, misplaced, refined = astuple(summary)
         usable = isinstance(refined, bool) and all(
             type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers
         )
         for names in (left_out, misplaced):
             usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)
-        return verdict if usable and (not verdict.registered or has_model(kept / "model")) else None
+        return summary if usable and (not summary.registered or has_model(kept / "model")) else None
     except (OSError, ValueError, TypeError, RecursionError):
         return None
 

@@ -21,7 +21,7 @@ from linprim_geo.base.options import SceneOptions, with_changes
 from linprim_geo.capture import video_frames
 from linprim_geo.capture.found_poses import (
     _COPIES,
-    Verdict,
+    PoseSummary,
     _base,
     _key,
     _readable,
@@ -88,7 +88,7 @@ def find_poses(
     Args:
         cache: see `photos.cache_folder`.
         threads: 0 uses all cores.
-        log: called with lines of progress and with the verdict.
+        log: called with lines of progress and with the summary.
         refine: called once per model with `root`, the model's folder, an empty folder and `log`; returns whether it has
             written a better model to the empty folder. Example: `stereo.refine_found_poses.refined_model`.
 
@@ -106,23 +106,23 @@ def find_poses(
     kept = _base(cache) / _key(folder, names)
     wait = partial(say, "another process is finding these poses; waiting for it ...")
     with locked(kept, "worked on", wait=wait):
-        verdict = _stored(kept)
-        if verdict is None:
+        summary = _stored(kept)
+        if summary is None:
             start = time.monotonic()
             say(f"finding the poses of {len(names)} photographs in {folder} ...")
-            verdict = _reconstruct(folder, names, sizes, kept, threads, say)
-            say(f"{verdict}; {time.monotonic() - start:.0f} s")
+            summary = _reconstruct(folder, names, sizes, kept, threads, say)
+            say(f"{summary}; {time.monotonic() - start:.0f} s")
         else:
-            say(f"{verdict}; from {kept}")
-        _refuse(root, verdict)
-        if refine is not None and not verdict.refined:
-            _refine(root, kept, verdict, refine, say)
-    if verdict.doubts:
-        say(f"warning: the poses are poor, and so may be the result: {verdict.doubts}")
+            say(f"{summary}; from {kept}")
+        _refuse(root, summary)
+        if refine is not None and not summary.refined:
+            _refine(root, kept, summary, refine, say)
+    if summary.doubts:
+        say(f"warning: the poses are poor, and so may be the result: {summary.doubts}")
     return kept / "model"
 
 
-def _refine(root: Path, kept: Path, verdict: Verdict, refine: Refine, say: Callable[[str], None]) -> None:
+def _refine(root: Path, kept: Path, summary: PoseSummary, refine: Refine, say: Callable[[str], None]) -> None:
     """Replace the model in `kept` by the refined one, if there is one, and record that refinement was done."""
     part, start = kept / "model.part", time.monotonic()
     shutil.rmtree(part, ignore_errors=True)
@@ -132,7 +132,7 @@ def _refine(root: Path, kept: Path, verdict: Verdict, refine: Refine, say: Calla
         part.rename(kept / "model")
         say(f"poses refined in {time.monotonic() - start:.0f} s")
     shutil.rmtree(part, ignore_errors=True)
-    write_json(kept / "verdict.json", asdict(replace(verdict, refined=True)))
+    write_json(kept / "summary.json", asdict(replace(summary, refined=True)))
 
 
 def _reconstruct(
@@ -142,8 +142,8 @@ def _reconstruct(
     kept: Path,
     threads: int,
     say: Callable[[str], None],
-) -> Verdict:
-    """Continue with the files in `kept`, and write the largest model and the verdict there."""
+) -> PoseSummary:
+    """Continue with the files in `kept`, and write the largest model and the summary there."""
     database = kept / "database.db"  # left by an interrupted run
     there = database.stat().st_size if database.exists() else 0
     check_room(kept, ROOM + ROOM_PER_PHOTOGRAPH * len(names) - there)
@@ -153,7 +153,7 @@ def _reconstruct(
     except (ValueError, RuntimeError, MemoryError) as error:
         reason = (str(error).splitlines() or ["out of memory"])[0]
         raise LinprimError(f"{folder}: poses cannot be found ({reason}); remove {kept} to begin anew") from error
-    verdict = Verdict(len(names), 0)
+    summary = PoseSummary(len(names), 0)
     if model is not None:
         part = kept / "model.part"
         for place in (part, kept / "model"):
@@ -165,8 +165,8 @@ def _reconstruct(
         posed = {model.images[number].name for number in model.reg_image_ids()}
         left_out = tuple(name for name in names if name not in posed)
         doubted = tuple(model.images[number].name for number in misplaced)
-        verdict = Verdict(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out, doubted)
-    write_json(kept / "verdict.json", asdict(verdict))
+        summary = PoseSummary(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out, doubted)
+    write_json(kept / "summary.json", asdict(summary))
     remove_work(kept)
     shutil.rmtree(kept / _COPIES, ignore_errors=True)
-    return verdict
+    return summary

@@ -20,7 +20,7 @@ from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.files import locked
 from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
 from linprim_geo.capture import incremental_mapping as image_pairs
-from linprim_geo.capture.found_poses import Verdict, found_model, photographs
+from linprim_geo.capture.found_poses import PoseSummary, found_model, photographs
 from linprim_geo.capture.incremental_mapping import adjust_robustly, pairs_to_match
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import find_poses, prepare
@@ -230,22 +230,27 @@ def test_captures_with_poses_are_not_searched(tmp_path, monkeypatch):
     prepare(tmp_path)
 
 
-def test_verdicts_describe_doubts():
+def test_summaries_describe_doubts():
     assert (
-        Verdict(4, 2).unusable and Verdict(10, 4).unusable and not Verdict(6, 3).unusable and not Verdict(3, 3).unusable
+        PoseSummary(4, 2).unusable
+        and PoseSummary(10, 4).unusable
+        and not PoseSummary(6, 3).unusable
+        and not PoseSummary(3, 3).unusable
     )
-    assert Verdict(10, 10, 500, 0.5, 4.0).doubts == ""
+    assert PoseSummary(10, 10, 500, 0.5, 4.0).doubts == ""
     names = tuple(f"{k}.jpg" for k in range(8))
-    assert Verdict(9, 8, 500, 0.5, 4.0, names[:1]).doubts.startswith("1 photograph is left out (0.jpg), so take some")
-    assert "(0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg and 2 more)" in Verdict(20, 12, 500, 0.5, 4.0, names).doubts
-    doubted = Verdict(20, 20, 500, 0.5, 4.0, (), names).doubts
+    assert PoseSummary(9, 8, 500, 0.5, 4.0, names[:1]).doubts.startswith(
+        "1 photograph is left out (0.jpg), so take some"
+    )
+    assert "(0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg and 2 more)" in PoseSummary(20, 12, 500, 0.5, 4.0, names).doubts
+    doubted = PoseSummary(20, 20, 500, 0.5, 4.0, (), names).doubts
     assert doubted.startswith("most matches of 8 photographs contradict their poses (0.jpg") and "taken for" in doubted
-    poor = Verdict(10, 10, 500, 1.5, 2.5).doubts
+    poor = PoseSummary(10, 10, 500, 1.5, 2.5).doubts
     assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
 
 
 def test_poor_poses_give_one_warning(copied, tmp_path, monkeypatch):
-    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: Verdict(9, 6, 100, 0.4, 3.5))
+    monkeypatch.setattr(structure_from_motion, "_reconstruct", lambda *_: PoseSummary(9, 6, 100, 0.4, 3.5))
     lines: list[str] = []
     find_poses(copied, tmp_path / "cache", log=lines.append)
     (warning,) = [line for line in lines if "warning" in line]
@@ -335,7 +340,7 @@ def test_a_second_process_waits_for_the_poses(copied, posed, tmp_path, monkeypat
         other.start()
         assert waiting.wait(10) and lines == ["another process is finding these poses; waiting for it ..."]
         shutil.copytree(model, kept / "model")
-        shutil.copy(model.parent / "verdict.json", kept)
+        shutil.copy(model.parent / "summary.json", kept)
     other.join(10)
     assert done.is_set() and len(lines) == 2
 
@@ -382,7 +387,7 @@ def test_webp_photographs_are_read(copied, posed, tmp_path):
     assert len(same.xyz) > 100 and same.rgb.std() > 10
     assert sorted(path.name for path in found_model(copied, cache).parent.iterdir()) == [
         "model",
-        "verdict.json",
+        "summary.json",
     ]
 
 
@@ -414,7 +419,7 @@ def test_damaged_results_are_not_used(copied, posed, tmp_path, damaged):
     kept = shutil.copytree(found_model(copied, posed[0]).parent, tmp_path / "structure_from_motion" / "k").parent
     kept = (kept / "k").rename(kept / found_model(copied, posed[0]).parent.name)
     assert found_model(copied, tmp_path) == kept / "model"
-    (kept / "verdict.json").write_bytes(damaged)
+    (kept / "summary.json").write_bytes(damaged)
     assert found_model(copied, tmp_path) is None
 
 
