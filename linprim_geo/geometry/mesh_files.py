@@ -21,9 +21,6 @@ SUFFIXES = (".ply", ".obj", ".glb", ".stl")
 _GLB_HEADER, _GLB_CHUNK_HEADER = 12, 8
 
 
-# --- files -----------------------------------------------------------------------------------------------
-
-
 def load_mesh(path: str | os.PathLike) -> Mesh:
     """Read a PLY, OBJ, GLB or STL file (or any other that trimesh reads) as one triangle mesh.
 

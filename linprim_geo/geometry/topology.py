@@ -6,8 +6,6 @@ import numpy as np
 
 from linprim_geo.geometry.mesh import Mesh, face_areas, face_components
 
-# --- topology --------------------------------------------------------------------------------------------
-
 
 def topology(mesh: Mesh) -> dict:
     """Return counts and measures of a mesh, as stored in `stats.json`.

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.geometry.mesh import Mesh, face_normals, validate_mesh
 from linprim_geo.surface.finish.mesh_process import paired_edges
-
-if TYPE_CHECKING:
-    pass
 from linprim_geo.surface.texture.texture_raster import INSIDE, _candidates, _weights
 
 # Free texels on each side of a chart; between two charts lie twice as many.
@@ -21,9 +16,6 @@ LEAST_COSINE = 0.4
 # Weight of the three neighbours' agreement against the cosine in the choice of a face's axis, and most rounds of
 # choosing.
 COHERENCE, ROUNDS = 1.0, 24
-
-
-# --- charts ----------------------------------------------------------------------------------------------
 
 
 def unwrap(mesh: Mesh, size: int) -> tuple[np.ndarray, int]:

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-
-if TYPE_CHECKING:
-    pass
-
 
 # Distance in texels up to which texels belong to a face: all that bilinear sampling of a point of the face can touch.
 RING = 1.5
