@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from linprim_geo.base.errors import LinprimError
 from linprim_geo.base.files import atomic_write
-from linprim_geo.geometry.mesh import Mesh
-from linprim_geo.geometry.mesh_files import needs_double, write_rows
-
-if TYPE_CHECKING:
-    pass
-
-
-import os
-
-from linprim_geo.geometry.mesh import merge_vertices
-from linprim_geo.geometry.mesh_files import load_with_visual
+from linprim_geo.geometry.mesh import Mesh, merge_vertices
+from linprim_geo.geometry.mesh_files import load_with_visual, needs_double, write_rows
 from linprim_geo.surface.texture.texture import Texture, _check_suffix
-
-# --- files -----------------------------------------------------------------------------------------------
 
 
 def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
     """Write a mesh with its texture: .obj with an .mtl and a .png of the same name beside it, or .glb with the image
     inside.
 
-    Coordinates are as `save_mesh` writes them; colours and quality of the vertices are left out.
+    Coordinates are as `save_mesh` writes them; colours and quality of the vertices are left out. If a file cannot be
+    written, those that were there before stay as they were.
 
     Raises:
         LinprimError: another suffix, an empty mesh, or a folder that cannot be written.
@@ -45,15 +36,17 @@ def save_textured(path: str | Path, mesh: Mesh, texture: Texture) -> None:
         with atomic_write(path) as temporary:
             temporary.write_bytes(_glb(mesh, texture, picture))
         return
-    with atomic_write(path.with_suffix(".png")) as temporary:
-        picture.save(temporary)
-    with atomic_write(path.with_suffix(".mtl")) as temporary:
-        temporary.write_text(
+    with ExitStack() as files:
+        # The last one entered gets its name first: the image, then what refers to it.
+        obj, mtl, png = (
+            files.enter_context(atomic_write(path.with_suffix(suffix))) for suffix in (path.suffix, ".mtl", ".png")
+        )
+        picture.save(png)
+        mtl.write_text(
             f"newmtl surface\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 1\nmap_Kd {path.with_suffix('.png').name}\n",
             encoding="utf-8",
         )
-    with atomic_write(path) as temporary:
-        _write_obj(temporary, mesh, texture, path.with_suffix(".mtl").name)
+        _write_obj(obj, mesh, texture, path.with_suffix(".mtl").name)
 
 
 def _seams(mesh: Mesh, texture: Texture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

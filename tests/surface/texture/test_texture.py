@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,7 +23,7 @@ from linprim_geo.runs.run import Run
 from linprim_geo.surface.extract import extract_mesh
 from linprim_geo.surface.normals import vertex_normals
 from linprim_geo.surface.texture import texture as texture_module
-from linprim_geo.surface.texture import texture_charts, texture_raster
+from linprim_geo.surface.texture import texture_charts, texture_files, texture_raster
 from linprim_geo.surface.texture.texture import make_texture
 from linprim_geo.surface.texture.texture_charts import unwrap
 from linprim_geo.surface.texture.texture_files import save_textured
@@ -292,6 +294,24 @@ def test_textures_in_other_formats_than_obj_and_glb_are_refused(ball, ball_textu
     with pytest.raises(LinprimError, match="no faces"):
         save_textured(tmp_path / "m.obj", empty, ball_texture.select(np.zeros(len(ball[0].faces), bool)))
     assert not list(tmp_path.iterdir())
+
+
+def test_an_obj_that_cannot_be_written_leaves_the_files_of_before(ball, ball_texture, tmp_path, monkeypatch):
+    path = tmp_path / "m.obj"
+    save_textured(path, ball[0], ball_texture)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(texture_files, "_write_obj", full)
+    darker = replace(ball_texture, image=ball_texture.image // 2)
+    with pytest.raises(LinprimError, match="no space left"):
+        save_textured(path, ball[0], darker)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    with pytest.raises(LinprimError, match="no space left"):
+        save_textured(tmp_path / "other" / "m.obj", ball[0], darker)
+    assert not list((tmp_path / "other").iterdir())
 
 
 def test_extraction_writes_textures(solid, tmp_path):
