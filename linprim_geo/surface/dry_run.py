@@ -32,10 +32,11 @@ STEREO_PIXEL, MERGED_PIXEL, MERGED_FACE, RENDERED_FACE, FINISHED_FACE = 120, 45,
 def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = None, *, quiet: bool = False) -> dict:
     """Estimate what `extract_mesh` by method tsdf would take with the same options. Nothing is written.
 
-    Returns: `views`; `level`; `stereo_downscale`, the K of the means of K by K pixels that stereo uses, 0 without
+    Returns: `views`; `level`; `stereo`: yes, no, or if needed (for objects with masks: if photographs agree too little
+        on the surface without it); `stereo_downscale`, the K of the means of K by K pixels that stereo uses, 0 without
         stereo; `voxel_size` in the data set's unit; `faces`, about; `peak_gib` of the stages `level`, `render`,
-        `stereo` (for objects with masks only if the photographs ask for it), `fuse` and `finish`; `memory_gib`, the
-        largest of these; `available_gib`, what is free or --memory-limit; and whether it `fits`.
+        `stereo`, `fuse` (if stereo is not certain, without it) and `finish`; `memory_gib`, the largest of these;
+        `available_gib`, what is free or --memory-limit; and whether it `fits`.
 
     Accuracy: the peak of each stage within a quarter (measured: docs/surfaces.md).
 
@@ -63,8 +64,9 @@ def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = N
         if room is not None:  # a grid that would not fit gets larger voxels
             faces = min(faces, room // RENDERED_FACE)
     now, pixels = memory_gib(), sum(camera.width * camera.height for camera in cameras)
-    fused = RENDERED_FACE * faces
+    fused, stereo = RENDERED_FACE * faces, "if needed" if factor else "no"
     if factor and (options.stereo == "on" or not opened.scene().has_alpha):
+        stereo = "yes"
         fused = MERGED_FACE * faces + MERGED_PIXEL * pixels
     peaks = stages.report()["peak_gib"]
     del peaks["total"]
@@ -76,6 +78,7 @@ def extraction_memory(run: str | os.PathLike, options: ExtractOptions | None = N
     return {
         "views": len(views),
         "level": level,
+        "stereo": stereo,
         "stereo_downscale": factor,
         "voxel_size": voxel,
         "faces": faces,
@@ -91,6 +94,8 @@ def describe(report: dict) -> str:
     factor = report["stereo_downscale"]
     of_means = f" of means of {factor} by {factor} pixels" if factor > 1 else ""
     stereo = f"stereo{of_means}" if factor else "no stereo"
+    if report["stereo"] == "if needed":
+        stereo += " if photographs agree too little without it"
     lines = [
         f"surface: about {report['faces']} faces out of {report['views']} photographs, voxels of about "
         f"{report['voxel_size']:.3g}, {stereo}",

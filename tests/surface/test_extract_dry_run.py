@@ -62,6 +62,17 @@ def test_the_command_prints_readable_lines(run, capsys):
         assert words in out
 
 
+def test_stereo_of_objects_with_masks_is_not_certain(run):
+    options = ExtractOptions(level=0.5, voxel_size=0.05)
+    report = extraction_memory(run, options, quiet=True)
+    assert report["stereo"] == "if needed" and report["peak_gib"]["stereo"] > 0
+    assert "stereo if photographs agree too little without it\n" in describe(report)
+    certain = extraction_memory(run, replace(options, stereo="on"), quiet=True)
+    assert certain["stereo"] == "yes" and "0.05, stereo\n" in describe(certain)
+    assert certain["peak_gib"]["fuse"] > report["peak_gib"]["fuse"]
+    assert extraction_memory(run, replace(options, stereo="off"), quiet=True)["stereo"] == "no"
+
+
 def test_stereo_memory_is_that_of_photographs_that_fit(run, monkeypatch):
     cameras = [view.camera for view in Run.open(run).scene().train]
     monkeypatch.setattr(Scene, "has_alpha", False)
