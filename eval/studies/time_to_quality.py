@@ -38,6 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "5,000 steps": {"iterations": 5000},
     "3,500 steps": {"iterations": 3500},
     "1,500 steps": {"iterations": 1500},
+    "no overlap": {"order": "center"},
     "overlap from 0.7": {"order_from": 0.7},
     "overlap from 0.85": {"order_from": 0.85},
 }
