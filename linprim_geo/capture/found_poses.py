@@ -30,7 +30,7 @@ _LARGEST = 1e12
 # a warning is given.
 _MIN_SHARE = 0.5
 _GOOD_SHARE = 0.9
-_GOOD_ERROR_PX = 1.0
+_GOOD_ERROR_PX = 1.0  # in pixels of the images in which keypoints were detected
 _GOOD_TRACK = 3.0
 # Largest number of file names in a message.
 _LISTED = 6
@@ -42,7 +42,8 @@ class PoseSummary:
 
     Number of photographs, number with a pose, number of points, mean reprojection error in pixels, mean number of
     photographs that see a point (track length), names of photographs without a pose (`left_out`), names of photographs
-    whose pose contradicts most of their matches (`misplaced`), and whether refining the poses was tried.
+    whose pose contradicts most of their matches (`misplaced`), whether refining the poses was tried, and the width of a
+    pixel of the images in which keypoints were detected, in pixels of the photographs (`keypoint_px`, from 1 up).
     """
 
     photographs: int
@@ -53,6 +54,7 @@ class PoseSummary:
     left_out: tuple[str, ...] = ()
     misplaced: tuple[str, ...] = ()
     refined: bool = False
+    keypoint_px: float = 1.0
 
     def __str__(self) -> str:
         return (
@@ -80,7 +82,7 @@ class PoseSummary:
                 " for another that looks the same, so take more there, which overlap by two thirds and show what is"
                 " there only once"
             )
-        if self.error_px > _GOOD_ERROR_PX:
+        if self.error_px > _GOOD_ERROR_PX * self.keypoint_px:
             poor.append(f"points miss their keypoints by {self.error_px:.2f} px, so let nothing move, and do not zoom")
         if self.track_length < _GOOD_TRACK:
             poor.append(f"a point is seen by {self.track_length:.1f} photographs only, so take more of each place")
@@ -171,9 +173,9 @@ def _stored(kept: Path) -> PoseSummary | None:
     """Return the summary stored in a folder, or None if there is none or it is unusable; it is then made again."""
     try:
         summary = PoseSummary(**json.loads((kept / "summary.json").read_text(encoding="utf-8")))
-        *numbers, left_out, misplaced, refined = astuple(summary)
+        *numbers, left_out, misplaced, refined, keypoint_px = astuple(summary)
         usable = isinstance(refined, bool) and all(
-            type(value) in (int, float) and 0 <= value < _LARGEST for value in numbers
+            type(value) in (int, float) and 0 <= value < _LARGEST for value in (*numbers, keypoint_px)
         )
         for names in (left_out, misplaced):
             usable = usable and isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names)

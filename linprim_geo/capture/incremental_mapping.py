@@ -116,6 +116,12 @@ def largest_model(
     return _map(database_path, folder, work, threads, len(names), say)
 
 
+def keypoint_pixel(sizes: Sequence[tuple[int, int]]) -> float:
+    """Return the width of a pixel of the images in which keypoints are detected, in pixels of the photographs: the
+    median over their `sizes`."""
+    return float(np.median([max(1.0, max(size) / _WIDEST) for size in sizes]))
+
+
 def remove_work(work: Path) -> None:
     """Remove the files that `largest_model` has stored."""
     for leftover in work.glob("database.db*"):

@@ -29,7 +29,7 @@ from linprim_geo.capture.found_poses import (
     _stored,
     photographs,
 )
-from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, largest_model, remove_work
+from linprim_geo.capture.incremental_mapping import MIN_REGISTERED, keypoint_pixel, largest_model, remove_work
 from linprim_geo.capture.load import has_poses
 from linprim_geo.geometry.pycolmap_files import write_model
 from linprim_geo.imaging import photos
@@ -165,7 +165,8 @@ def _reconstruct(
         posed = {model.images[number].name for number in model.reg_image_ids()}
         left_out = tuple(name for name in names if name not in posed)
         doubted = tuple(model.images[number].name for number in misplaced)
-        summary = PoseSummary(len(names), model.num_reg_images(), model.num_points3D(), *errors, left_out, doubted)
+        counts = len(names), model.num_reg_images(), model.num_points3D()
+        summary = PoseSummary(*counts, *errors, left_out, doubted, keypoint_px=keypoint_pixel(sizes))
     write_json(kept / "summary.json", asdict(summary))
     remove_work(kept)
     shutil.rmtree(kept / _COPIES, ignore_errors=True)

@@ -19,9 +19,8 @@ from PIL import Image
 from linprim_geo.base.errors import DiskFull, LinprimError
 from linprim_geo.base.files import locked
 from linprim_geo.capture import found_poses, incremental_mapping, structure_from_motion
-from linprim_geo.capture import incremental_mapping as image_pairs
 from linprim_geo.capture.found_poses import PoseSummary, found_model, photographs
-from linprim_geo.capture.incremental_mapping import adjust_robustly, pairs_to_match
+from linprim_geo.capture.incremental_mapping import adjust_robustly, keypoint_pixel, pairs_to_match
 from linprim_geo.capture.load import load_scene
 from linprim_geo.capture.structure_from_motion import find_poses, prepare
 from linprim_geo.capture.types import PHOTOGRAPHS
@@ -197,7 +196,7 @@ def test_photographs_without_overlap_are_refused_and_the_result_cached(tmp_path,
 
 
 def test_blank_and_truncated_photographs_are_left_out(copied, tmp_path, monkeypatch):
-    monkeypatch.setattr(image_pairs, "_MATCH_ALL", 3)
+    monkeypatch.setattr(incremental_mapping, "_MATCH_ALL", 3)
     Image.new("RGB", SIZE, (120, 120, 120)).save(copied / "blank.png")
     (copied / "3.png").rename(copied / "my  photo 3.png")
     (copied / "cut.png").write_bytes((copied / "2.png").read_bytes()[:5000])
@@ -247,6 +246,13 @@ def test_summaries_describe_doubts():
     assert doubted.startswith("most matches of 8 photographs contradict their poses (0.jpg") and "taken for" in doubted
     poor = PoseSummary(10, 10, 500, 1.5, 2.5).doubts
     assert "1.50 px" in poor and "2.5 photographs only" in poor and "left out" not in poor
+
+
+def test_errors_are_judged_in_pixels_of_the_images_with_keypoints():
+    large, small = (4032, 3024), (480, 360)
+    assert keypoint_pixel([large, large, small]) == 4032 / 2000 and keypoint_pixel([small]) == 1
+    assert PoseSummary(10, 10, 500, 1.5, 4.0, keypoint_px=2.0).doubts == ""
+    assert "2.10 px" in PoseSummary(10, 10, 500, 2.1, 4.0, keypoint_px=2.0).doubts
 
 
 def test_poor_poses_give_one_warning(copied, tmp_path, monkeypatch):
@@ -413,6 +419,7 @@ def test_photographs_with_a_wrong_suffix_are_copied_as_png(tmp_path):
         b'{"photographs": 1' + b"0" * 400 + b', "registered": 9}',
         b'{"photographs": 9, "registered": 9, "points": null}',
         b'{"photographs": 9, "registered": 9, "misplaced": [1]}',
+        b'{"photographs": 9, "registered": 9, "keypoint_px": NaN}',
     ],
 )
 def test_damaged_results_are_not_used(copied, posed, tmp_path, damaged):
