@@ -246,7 +246,7 @@ class TrainOptions:
     iterations: int = option(7000, "training steps; each uses one view", low=1, high=10**8)
     coarse: str = option(
         "auto",
-        "auto: average photographs down by 2, 4, ... in the first 80 % of the steps, as far as 2 pixels for each "
+        "auto: average photographs down by 2, 4, ... in the first 90 % of the steps, as far as 2 pixels for each "
         "primitive and 200 along the longer side are left; saves a quarter to two thirds of the time. off: full "
         "size in all steps",
         choices=("auto", "off"),

@@ -49,8 +49,8 @@ def test_photographs_are_averaged_while_primitives_have_pixels(size, primitives,
 def test_phases_halve_the_factor_until_photographs_are_whole():
     images = [image(1600, 1200)]
     coarse = CoarseImages(images, TrainOptions(max_primitives=10_000))
-    assert coarse.phases() == [(0.0, 8), (0.2, 4), (0.4, 2), (0.8, 1)]
-    assert [coarse.factor(share) for share in (0.0, 0.19, 0.2, 0.79, 0.8, 1.0)] == [8, 8, 4, 2, 1, 1]
+    assert coarse.phases() == [(0.0, 8), (0.225, 4), (0.45, 2), (0.9, 1)]
+    assert [coarse.factor(share) for share in (0.0, 0.22, 0.225, 0.89, 0.9, 1.0)] == [8, 8, 4, 2, 1, 1]
     assert CoarseImages(images, TrainOptions(coarse="off")).phases() == [(0.0, 1)]
     late = CoarseImages(images, TrainOptions(max_primitives=20_000, sensor_depth=1.0, geometry_from=0.6))
     assert late.phases() == [(0.0, 4), (0.3, 2), (0.6, 1)]
@@ -96,7 +96,7 @@ def test_a_coarse_run_resumes_bit_for_bit_and_ends_on_whole_photographs(tiny_sce
     monkeypatch.setattr(CoarseImages, "image", lambda self, i, factor: sizes.append(factor) or used(self, i, factor))
     train(tiny_scene, tmp_path / "whole", options=options, quiet=True)
     assert sizes[0] > 1 and sizes == sorted(sizes, reverse=True)
-    assert sizes[31:] == [2] + [1] * 8
+    assert sizes[35:] == [2] + [1] * 4
     advance = Trainer.advance
 
     def die(self):

@@ -171,8 +171,8 @@ def test_the_cost_of_each_phase_is_measured(tiny_run, monkeypatch):
         lambda given: start_trainer(run.scene(), run, images, given, None),
         evaluate,
     )
-    assert cost.phases == [(0.0, 1 / 4), (0.4, 1.0), (0.7, 3.0), (0.8, 12.0)]
-    assert cost.mean() == pytest.approx(0.1 + 0.3 + 0.3 + 2.4)
+    assert cost.phases == [(0.0, 1 / 4), (0.45, 1.0), (0.7, 3.0), (0.9, 12.0)]
+    assert cost.mean() == pytest.approx(0.45 / 4 + 0.25 + 0.2 * 3 + 0.1 * 12)
 
 
 # --- whole runs ------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from linprim_geo.training.step.training_images import TrainingImage, photo_limit
 
 # Share of the run from which on photographs have their full size. The factor is 2 in the second half of the steps
 # before, 4 in the second half of the steps before those, and so on.
-FULL_FROM = 0.8
+FULL_FROM = 0.9
 # An averaged photograph has at least PIXELS_PER_PRIMITIVE pixels (with masks: of the foreground) for each of the
 # --max-primitives, and at least LEAST_SIDE pixels along its longer side: the loss compares windows of 11 pixels.
 PIXELS_PER_PRIMITIVE, LEAST_SIDE = 2, 200
