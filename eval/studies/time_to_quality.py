@@ -40,7 +40,6 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "1,500 steps": {"iterations": 1500},
     "no overlap": {"order": "center"},
     "overlap from 0.7": {"order_from": 0.7},
-    "overlap from 0.85": {"order_from": 0.85},
 }
 COLUMNS = {
     "capture": "capture",
