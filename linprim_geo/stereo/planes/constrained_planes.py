@@ -62,12 +62,16 @@ class ConstrainedPlanes:
         return result
 
     def at_right_angles(
-        self, planes: np.ndarray, staying: Container[int], from_edges: Container[int] = ()
+        self,
+        planes: np.ndarray,
+        staying: Container[int],
+        frame: np.ndarray | None = None,
+        from_edges: Container[int] = (),
     ) -> np.ndarray:
-        """Turn planes to right angles with each other, or to the frame of those `staying`, if the turned plane carries
-        the shading of its regions as well as true walls do. Then shift each to where most confirmed depths along the
-        edges of its regions are. Those `staying` are not changed, nor those known from points along edges,
-        `from_edges`, that would turn by more than NEARLY."""
+        """Turn planes to right angles with each other, or to the `frame` (3, 3) of the room (default: of those
+        `staying`), if the turned plane carries the shading of its regions as well as true walls do. Then shift each to
+        where most confirmed depths along the edges of its regions are. Those `staying` are not changed, nor those known
+        from points along edges, `from_edges`, that would turn by more than NEARLY."""
         few = [[region.some(MOST_BOXES) for region in regions] for regions in self.carried]
         fits = [
             evaluate(plane, few[k], self.shadings) if few[k] and k not in staying else None
@@ -76,7 +80,9 @@ class ConstrainedPlanes:
         # Planes by edges that carry no shading are not used as a reference.
         rows = [k for k, fit in enumerate(fits) if k in staying or fit is not None]
         known = [None if (fit := fits[k]) is None else fit.information for k in rows]
-        frame, turned = frame_of(planes[[k for k in rows if k in staying], :3]), planes.copy()
+        if frame is None:
+            frame = frame_of(planes[[k for k in rows if k in staying], :3])
+        turned = planes.copy()
         turned[rows] = orthogonalised(planes[rows], known, lambda row, plane: plane_moves(plane, few[rows[row]]), frame)
         for k, fit in enumerate(fits):
             if fit is None or (turned[k] == planes[k]).all():

@@ -1,9 +1,10 @@
 """Planes of large flat surfaces, fitted to confirmed points of stereo.
 
 On a floor or a wall with weak texture, stereo confirms only some depths, and these are noisy. Planes with many
-confirmed points of several views, also by their normals, are found one after the other by RANSAC. The depth of such a
-plane replaces confirmed depths that stereo cannot tell from it. It is also taken where most unconfirmed depths around
-lie on it, as noise and outliers would not.
+confirmed points of several views, also by their normals, are found one after the other by RANSAC, and then refitted
+together, each to the points that lie on it better than on any other. The depth of such a plane replaces confirmed
+depths that stereo cannot tell from it. It is also taken where most unconfirmed depths around lie on it, as noise and
+outliers would not.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy.ndimage import uniform_filter
 
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.depth_maps import DepthMap
-from linprim_geo.stereo.planes.plain_regions import FITS, LEAST_VIEWS, TOLERANCE, in_camera, rays_of, to_world
+from linprim_geo.stereo.planes.plain_regions import BEHIND, FITS, LEAST_VIEWS, TOLERANCE, in_camera, rays_of, to_world
 
 # Confirmed points of all views used in the search, those of them on which hypotheses are scored, and the number of
 # hypotheses.
@@ -26,6 +27,8 @@ POINTS, TRIED_ON, SEEDS = 40_000, 4_000, 300
 BEST_SEEDS, TOLERANCES = 10, (TOLERANCE / 4, TOLERANCE / 2, TOLERANCE)
 # The most planes, and the least share of the points that are inliers of each.
 MOST_PLANES, LEAST_SHARE = 30, 0.01
+# Rounds in which all planes are refitted together, and the least share of a plane's points that no other one holds.
+ROUNDS, OWN_SHARE = 10, 0.5
 # Normals of inliers are within 30 degrees of the plane's normal (a cosine).
 SAME_NORMAL = float(np.cos(np.radians(30)))
 # At least this share of the points within TOLERANCE of a plane is within half of it. Across a curved surface it is one
@@ -84,10 +87,16 @@ class SurfacePoints:
     def on(self, planes: np.ndarray, tolerance: float = TOLERANCE) -> np.ndarray:
         """Return (P, K) bool: which points are inliers of (K, 4) planes, up to a share of their distance, with similar
         normals."""
+        return self.residuals(planes) < tolerance
+
+    def residuals(self, planes: np.ndarray) -> np.ndarray:
+        """Return (P, K) how far (K, 4) planes are from the points along the rays of their cameras, as a share of the
+        distance; infinite where normals are not similar."""
         normal = planes[:, :3].T
         off = np.abs(self.position @ normal - planes[:, 3])
-        near = off < tolerance * np.abs((self.position - self.center) @ normal)
-        return near & (np.abs(self.normal @ normal) > SAME_NORMAL)
+        with np.errstate(divide="ignore", invalid="ignore"):  # rays parallel to the plane
+            share = off / np.abs((self.position - self.center) @ normal)
+        return np.where(np.abs(self.normal @ normal) > SAME_NORMAL, np.nan_to_num(share, nan=np.inf), np.inf)
 
 
 def confirmed_points(
@@ -101,15 +110,55 @@ def confirmed_points(
     return SurfacePoints.together(of_views), rng
 
 
-def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the (K, 4) planes n . x = d of the world with the most inliers among the confirmed `depths` (H, W) of
-    views, NaN elsewhere.
+def planes_of_points(points: SurfacePoints, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (K, 4) planes n . x = d of the world with the most inliers among points, and the (K,) sums of the
+    `closeness` of each plane's points to it.
 
-    Planes that hold their points within the least of TOLERANCES come first: with a large threshold, a plane may lie
-    across two surfaces, such as a picture on a wall and the head of a bed in front of it, and on neither.
+    Planes that hold their points within the least of TOLERANCES are found first: with a large threshold, a plane may
+    lie across two surfaces, such as a picture on a wall and the head of a bed in front of it, and on neither. All are
+    then refitted together, to the points that are closest to each, and planes without enough points of their own are
+    removed: one that lies across two surfaces loses its points to those of the surfaces.
     """
-    points, rng = confirmed_points(maps, depths)
-    least, planes, free = max(LEAST_SHARE * len(points), 3), list[np.ndarray](), np.arange(len(points))
+    least = max(LEAST_SHARE * len(points), 3)
+    planes = _found_in_turn(points, least, rng)
+    for _ in range(ROUNDS):
+        planes = _kept_together(points, _refitted(points, planes), least / 2)
+    residuals = points.residuals(planes)
+    near = closeness(residuals)
+    own = near.argmax(1) if len(planes) else np.zeros(len(points), int)
+    kept = []
+    for k in range(len(planes)):
+        mine = own == k
+        central, on = (mine & (residuals[:, k] < part) for part in (TOLERANCE / 2, TOLERANCE))
+        flat = np.count_nonzero(central) >= CENTRAL_SHARE * np.count_nonzero(on)
+        if flat and len(np.unique(points.view[on])) >= LEAST_VIEWS:
+            kept.append(k)
+    return planes[kept], np.array([near[own == k, k].sum() for k in kept])
+
+
+def closeness(residuals: np.ndarray) -> np.ndarray:
+    """Return how well points lie on planes, from 1 down to 0 at TOLERANCE, given their residuals: the mean of Tukey's
+    biweight functions of the TOLERANCES. Their sum is largest for planes that hold their points most closely."""
+    return np.mean([np.maximum(0, 1 - (residuals / part) ** 2) ** 2 for part in TOLERANCES], axis=0)
+
+
+def shifted_to(points: SurfacePoints, normal: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Return a plane (4,) with another `normal` (3,), where the points that were near the plane are closest."""
+    near = points[points.residuals(plane[None])[:, 0] < BEHIND * TOLERANCE]
+    along = near.position @ normal
+    towards = np.abs(along - near.center @ normal)
+    shifted = np.append(normal, np.median(along))
+    for _ in range(ROUNDS):
+        weight = _weights(near.residuals(shifted[None])[:, 0]) / np.maximum(towards, 1e-12) ** 2
+        if not weight.any():
+            break
+        shifted[3] = np.average(along, weights=weight)
+    return shifted
+
+
+def _found_in_turn(points: SurfacePoints, least: float, rng: np.random.Generator) -> np.ndarray:
+    """Return (K, 4) planes with `least` points or more, found one after the other among the points left."""
+    planes, free = list[np.ndarray](), np.arange(len(points))
     for tolerance in TOLERANCES:
         left = free
         while len(planes) < MOST_PLANES and len(left) >= least:
@@ -124,6 +173,40 @@ def planes_of_points(maps: Sequence[DepthMap], depths: Sequence[np.ndarray]) -> 
                 free = free[~points[free].on(plane[None])[:, 0]]
             left = left[~rest.on(plane[None])[:, 0]]
     return np.array(planes).reshape(-1, 4)
+
+
+def _refitted(points: SurfacePoints, planes: np.ndarray) -> np.ndarray:
+    """Return each plane refitted to the points that are closer to it than to the others."""
+    if not len(planes):
+        return planes
+    residuals, refitted = points.residuals(planes), planes.copy()
+    own = residuals.argmin(1)
+    for k in range(len(planes)):
+        weight = _weights(residuals[:, k]) * (own == k)
+        if np.count_nonzero(weight) >= 3:
+            refitted[k] = _fitted(points[weight > 0], weight[weight > 0])
+    return refitted
+
+
+def _weights(residuals: np.ndarray) -> np.ndarray:
+    """Return the weights of points in least squares that maximise the sum of their `closeness`."""
+    return np.sum([np.maximum(0, 1 - (residuals / part) ** 2) / part**2 for part in TOLERANCES], axis=0)
+
+
+def _kept_together(points: SurfacePoints, planes: np.ndarray, least: float) -> np.ndarray:
+    """Return the planes that each add `least` or more, and OWN_SHARE of what they have by themselves, to the sum of the
+    points' `closeness` to the nearest plane, the one that adds most first."""
+    near, best = closeness(points.residuals(planes)), np.zeros(len(points))
+    kept = list[int]()
+    while len(planes):
+        added = np.maximum(0, near - best[:, None]).sum(0)
+        added[added < OWN_SHARE * near.sum(0)] = 0
+        most = int(added.argmax())
+        if added[most] < least:
+            break
+        kept.append(most)
+        best = np.maximum(best, near[:, most])
+    return planes[kept]
 
 
 def _commonest_plane(
@@ -156,11 +239,13 @@ def _fitted_within(points: SurfacePoints, plane: np.ndarray, tolerance: float, l
     return plane if np.count_nonzero(points.on(plane[None], tolerance)) >= least else None
 
 
-def _fitted(points: SurfacePoints) -> np.ndarray:
-    """Fit a plane (4,) to points by least squares, weighted by 1 / distance, as far points are less exact."""
-    weight = 1 / np.maximum(np.linalg.norm(points.position - points.center, axis=1), 1e-12)
-    middle = np.average(points.position, axis=0, weights=weight**2)
-    scaled = (points.position - middle) * weight[:, None]
+def _fitted(points: SurfacePoints, weight: np.ndarray | None = None) -> np.ndarray:
+    """Fit a plane (4,) to points by least squares, weighted by 1 / distance, as far points are less exact, and by the
+    square root of (P,) `weight`."""
+    exact = 1 / np.maximum(np.linalg.norm(points.position - points.center, axis=1), 1e-12)
+    exact = exact if weight is None else exact * np.sqrt(weight)
+    middle = np.average(points.position, axis=0, weights=exact**2)
+    scaled = (points.position - middle) * exact[:, None]
     normal = np.linalg.eigh(scaled.T @ scaled)[1][:, 0]
     return np.append(normal, normal @ middle)
 

@@ -27,9 +27,10 @@ def at_right_angles(first: np.ndarray, second: np.ndarray) -> bool:
     return bool(abs(first[:3] @ second[:3]) < np.sin(NEARLY))
 
 
-def frame_of(normals: np.ndarray) -> np.ndarray | None:
-    """Return the frame of a room (3, 3): three orthogonal unit vectors along which most of (K, 3) unit normals lie.
-    None if no two normals are nearly at right angles."""
+def frame_of(normals: np.ndarray, weight: np.ndarray | None = None) -> np.ndarray | None:
+    """Return the frame of a room (3, 3): three orthogonal unit vectors along which most of (K, 3) unit normals lie,
+    which count by their (K,) `weight`, or 1. None if no two normals are nearly at right angles."""
+    weight = np.ones(len(normals)) if weight is None else weight
     found, most = None, 0.0
     for first in normals:
         for second in normals:
@@ -38,10 +39,10 @@ def frame_of(normals: np.ndarray) -> np.ndarray | None:
                 across /= np.linalg.norm(across)
                 axes = np.stack([first, across, np.cross(first, across)])
                 # Tukey's weight: normals that are not nearly along an axis count nothing.
-                along = (np.maximum(0, 1 - (angles_to(axes, normals) / NEARLY) ** 2) ** 2).sum()
+                along = weight @ np.maximum(0, 1 - (angles_to(axes, normals) / NEARLY) ** 2) ** 2
                 if along > most:
                     found, most = axes, along
-    return None if found is None else _middle(found, normals)
+    return None if found is None else _middle(found, normals, weight)
 
 
 def angles_to(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -49,8 +50,18 @@ def angles_to(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.arccos(np.minimum(np.abs(normals @ axes.T).max(1), 1))
 
 
-def _middle(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Rotate the axes to the least sum of angles to the normals that are nearly along them."""
+def off_frame(axes: np.ndarray | None, normals: np.ndarray) -> np.ndarray:
+    """Return the (K,) angles of (K, 3) unit normals to the nearest of the (3, 3) axes if they are nearly along it, and
+    otherwise to the nearest right angle with one, as those of roofs have; infinite without axes."""
+    if axes is None:
+        return np.full(len(normals), np.inf)
+    angle, lacking = angles_to(axes, normals), np.arcsin(np.minimum(np.abs(normals @ axes.T).min(1), 1))
+    return np.where(angle < NEARLY, angle, lacking)
+
+
+def _middle(axes: np.ndarray, normals: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Rotate the axes to the least sum, weighted by (K,) `weight`, of angles to the normals that are nearly along
+    them."""
     for _ in range(10 * ROUNDS):
         angle = angles_to(axes, normals)
         near = np.flatnonzero(angle < NEARLY)
@@ -58,7 +69,8 @@ def _middle(axes: np.ndarray, normals: np.ndarray) -> np.ndarray:
         nearest = np.abs(along).argmax(1)
         sign = np.sign(along[np.arange(len(near)), nearest])
         towards = np.zeros((3, 3))
-        np.add.at(towards, nearest, (sign / np.maximum(angle[near], RIGHT))[:, None] * normals[near])
+        share = weight[near] / weight.sum() * sign / np.maximum(angle[near], RIGHT)
+        np.add.at(towards, nearest, share[:, None] * normals[near])
         # An axis without normals stays where the others put it.
         left, _, right = np.linalg.svd(towards + 1e-3 * axes)
         axes = left @ right

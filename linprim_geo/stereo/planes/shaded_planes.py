@@ -39,7 +39,7 @@ from linprim_geo.stereo.planes.plain_regions import (
     rays_of,
     to_world,
 )
-from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, angles_to, frame_of
+from linprim_geo.stereo.planes.right_angles import NEARLY, RIGHT, off_frame
 from linprim_geo.stereo.planes.shaded_areas import ShadedArea, best_first, preferred_by_edges
 from linprim_geo.stereo.planes.shading import (
     BOX,
@@ -77,8 +77,9 @@ CERTAIN = 2 * CONFIRMED_DEPTH
 ALIKE_ANGLE = 4 * SAME_ANGLE
 # The background is so many times as far as the depth of a region.
 FAR = 1e4
-# A plane by points is askew if it is off the room's frame by more (radians): its error at a width of half its distance.
-ASKEW = 2 * TOLERANCE
+# The angle (radians) at which a plane errs by TOLERANCE at a width of half its distance. A plane by points that is off
+# the room's frame by more is askew.
+TOLERANCE_ANGLE = 2 * TOLERANCE
 # A plane carries a region if it explains the shading around half of its boxes.
 CARRIED_SHARE = 0.5
 
@@ -94,8 +95,9 @@ class ShadedPlanes:
         depths: (H, W) confirmed depth of each view, NaN elsewhere.
         rendered: (H, W) rendered depth of each view, 0 where none.
         by_points: (K, 4) planes with confirmed points all over; they are not changed.
-        by_edges: (K, 4) planes fitted to points along edges. Shading refines them; those along the frame of the planes
-            `by_points` are kept unrefined, too.
+        by_edges: (K, 4) planes fitted to points along edges. Shading refines them; those along the frame are kept
+            unrefined, too.
+        frame: (3, 3) of the room (`right_angles.frame_of`), None if it has none.
     """
 
     def __init__(
@@ -105,13 +107,14 @@ class ShadedPlanes:
         rendered: Sequence[np.ndarray],
         by_points: np.ndarray,
         by_edges: np.ndarray,
+        frame: np.ndarray | None,
     ):
         self.cameras = [found.camera for found in maps]
         law = vignetting(self.cameras, [found.grey for found in maps], depths)
         self.shadings = [Shading.of(found, law) for found in maps]
         self.small_cameras = [shading.camera for shading in self.shadings]
         self.given, self.by_points = np.concatenate([by_points, by_edges]), len(by_points)
-        self.given_count = len(self.given)
+        self.given_count, self.frame = len(self.given), frame
         self.depths = [shading.small(depth) for shading, depth in zip(self.shadings, depths, strict=True)]
         self.shown: list[list[ShadedRegion]] = []
         self.regions: list[list[FittedRegion]] = []
@@ -125,22 +128,22 @@ class ShadedPlanes:
         self.planes = self._common([one for own in self.regions for one in own if one.fit is not None])
         carried = self._take_originals(self._all_carriers())
         held = ConstrainedPlanes(self.shadings, self.depths, carried)
-        off_frame, from_edges = self._off_frame(), set(range(self.by_points, self.given_count))
-        along = {k for k in from_edges if off_frame[k] < RIGHT}
+        off, from_edges = off_frame(self.frame, self.planes[:, :3]), set(range(self.by_points, self.given_count))
+        along = {k for k in from_edges if off[k] < RIGHT}
         # Edges fix a plane along the frame well, but the region may be on another nearly flush with it.
         twice = [k for k in sorted(along) if carried[k]]
         from_edges.update(range(len(self.planes), len(self.planes) + len(twice)))
         self.planes = np.concatenate([self.planes, self.planes[twice]])
         carried += [carried[k] for k in twice]
         staying = along.union(range(self.by_points))
-        planes = held.at_right_angles(held.by_depths(self.planes, staying, from_edges), staying, from_edges)
+        planes = held.at_right_angles(held.by_depths(self.planes, staying, from_edges), staying, frame, from_edges)
         standing = held.still_carrying(on_meeting_lines(planes, self.by_points, maps, depths), planes)
         self.standing = np.isin(np.arange(len(planes)), list(standing))
         self.hanging = np.array([any(is_same(plane, planes[k]) for k in standing) for plane in planes], bool)
         self.hanging[self.by_points :] = False
         for number, plane in standing.items():
             planes[number] = plane
-        self.planes = held.at_right_angles(planes, {*staying, *standing}, from_edges)
+        self.planes = held.at_right_angles(planes, {*staying, *standing}, frame, from_edges)
 
     def _camera(self, region: ShadedRegion) -> Camera:
         return self.small_cameras[region.view]
@@ -357,8 +360,8 @@ class ShadedPlanes:
                     carried[k].append(one.region)
                     for j, others in of_region.items():
                         shared[j, k] += np.count_nonzero(boxes & others)
-        off, kept = self._off_frame(), list[int]()
-        by_points = [k for k in range(self.by_points) if not ASKEW < off[k] < NEARLY]
+        off, kept = off_frame(self.frame, self.planes[:, :3]), list[int]()
+        by_points = [k for k in range(self.by_points) if not TOLERANCE_ANGLE < off[k] < NEARLY]
         for k in sorted(range(self.by_points, count), key=lambda k: (k >= self.given_count, -shared[k, k])):
             same = next((j for j in by_points if self._same(j, k, carried[k], TOLERANCE)), None)
             if same is not None:
@@ -371,20 +374,15 @@ class ShadedPlanes:
         self.planes, self.given_count = self.planes[kept], sum(k < self.given_count for k in kept)
         return [carried[k] if self._of_several_views(self.planes[at], carried[k]) else [] for at, k in enumerate(kept)]
 
-    def _most_apart(self, first: int, second: int, off_frame: np.ndarray) -> float:
-        """Return the share of the depth by which duplicates may differ, by the planes' angles `off_frame` (K,)."""
-        by_edges = TOLERANCE if off_frame[[first, second]].max() < RIGHT else BEHIND * TOLERANCE
+    def _most_apart(self, first: int, second: int, off: np.ndarray) -> float:
+        """Return the share of the depth by which duplicates may differ, by (K,) angles `off` the frame."""
+        by_edges = TOLERANCE if off[[first, second]].max() < RIGHT else BEHIND * TOLERANCE
         return by_edges if max(first, second) < self.given_count else ALIKE_DEPTH
-
-    def _off_frame(self) -> np.ndarray:
-        """Return (K,) angles of the planes to the frame of those by points; infinite if these have no frame."""
-        frame = frame_of(self.planes[: self.by_points, :3])
-        return np.full(len(self.planes), np.inf) if frame is None else angles_to(frame, self.planes[:, :3])
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
         """Return whether two planes have nearly the same normal and, over the regions, median inverse depth."""
-        planes = self.planes[[first, second]]
-        if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(ALIKE_ANGLE):
+        planes, most_angle = self.planes[[first, second]], TOLERANCE_ANGLE if tolerance == TOLERANCE else ALIKE_ANGLE
+        if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(most_angle):
             return False
         inverse = [region.some(LEAST_BOXES).rays @ in_camera(self._camera(region), planes).T for region in regions]
         one, other = np.concatenate(inverse).T

@@ -15,7 +15,8 @@ import numpy as np
 from linprim_geo.stereo.depth_maps import SURE, DepthMap
 from linprim_geo.stereo.planes.constrained_planes import EQUAL_RATIO
 from linprim_geo.stereo.planes.plain_regions import common_planes, in_world, regions_of_views
-from linprim_geo.stereo.planes.point_planes import planes_of_points
+from linprim_geo.stereo.planes.point_planes import confirmed_points, planes_of_points
+from linprim_geo.stereo.planes.right_angles import frame_of
 from linprim_geo.stereo.planes.shaded_planes import (
     FAR,
     FIRST_BOXES,
@@ -47,8 +48,8 @@ def shows_sky(maps: Sequence[DepthMap]) -> list[bool]:
     sure = [np.where(found.is_confirmed(SURE), found.depth, np.float32(np.nan)) for found in maps]
     regions = [region for own in regions_of_views(maps, sure) for region in own]
     nothing = [np.zeros_like(depth) for depth in sure]
-    by_points, by_edges = planes_of_points(maps, sure), common_planes(cameras, regions)
-    shaded = ShadedPlanes(maps, sure, nothing, by_points, by_edges)
+    (by_points, weight), by_edges = planes_of_points(*confirmed_points(maps, sure)), common_planes(cameras, regions)
+    shaded = ShadedPlanes(maps, sure, nothing, by_points, by_edges, frame_of(by_points[:, :3], weight))
     planes, result = shaded.planes[shaded.by_points :], []
     for view, (shading, known) in enumerate(zip(shaded.shadings, shaded.depths, strict=True)):
         own = shaded_regions(view, shading, np.isfinite(known))

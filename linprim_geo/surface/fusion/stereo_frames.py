@@ -27,13 +27,13 @@ from linprim_geo.stereo.planes.enclosing_planes import (
     known_on_planes,
     region_depths,
 )
-from linprim_geo.stereo.planes.framed_planes import planes_by_edges
+from linprim_geo.stereo.planes.framed_planes import framed_planes_of_points, planes_by_edges
 from linprim_geo.stereo.planes.plain_regions import (
     TOLERANCE,
     PlainRegion,
     regions_of_views,
 )
-from linprim_geo.stereo.planes.point_planes import SurfacePoints, planes_of_points, point_plane_depth
+from linprim_geo.stereo.planes.point_planes import SurfacePoints, point_plane_depth
 from linprim_geo.stereo.planes.region_planes import RegionDepths, beside_edges, region_plane_depths
 from linprim_geo.stereo.planes.room_corners import with_corner_walls
 from linprim_geo.stereo.planes.seen_through import FreeSpaceTest
@@ -150,10 +150,10 @@ class MergedFrames(Sequence):
         """
         sure = [_depth_where(found, found.is_confirmed(SURE)) for found in maps]
         regions = regions_of_views(maps, sure)
-        by_points = planes_of_points(maps, sure)
+        by_points, frame = framed_planes_of_points(maps, sure)
         every = [region for own in regions for region in own]
-        by_edges = planes_by_edges(self.cameras, every, by_points)
-        shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges)
+        by_edges = planes_by_edges(self.cameras, every, frame)
+        shaded = ShadedPlanes(maps, sure, rendered, by_points, by_edges, frame)
         self.planes, self.standing = shaded.planes[~shaded.hanging], shaded.standing[~shaded.hanging]
         on_points = [point_plane_depth(found, own, by_points) for found, own in zip(maps, sure, strict=True)]
         backgrounds = [shaded.is_background(view) for view in range(len(maps))]

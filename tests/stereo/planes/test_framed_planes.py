@@ -10,9 +10,10 @@ from helpers.captures import look_at
 from linprim_geo.geometry.camera import Camera
 from linprim_geo.stereo.planes.framed_planes import along_frame, planes_by_edges
 from linprim_geo.stereo.planes.plain_regions import PlainRegion, common_planes, rays_of
+from linprim_geo.stereo.planes.right_angles import frame_of
 
 FLOOR, SIDE = np.array([0.0, 0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0, -1.5])
-ROOM = np.array([FLOOR, SIDE])
+ROOM = frame_of(np.array([FLOOR, SIDE])[:, :3])
 CAMERAS = [look_at((x, 2.5, 1.0), target=(0, 0, 1), size=(64, 48), focal=50.0) for x in (-1.0, 0.0, 1.0)]
 
 
@@ -63,22 +64,31 @@ def test_a_plane_across_two_nearly_flush_faces_takes_the_one_with_more_points():
     assert abs(found[0, 3]) < 0.002
 
 
-@pytest.mark.parametrize("degrees", [3.0, 15.0])
-def test_a_leaning_surface_is_not_turned(degrees):
+@pytest.mark.parametrize("degrees", [3.0, 15.0, 38.0])
+def test_a_leaning_surface_stays_at_a_right_angle_to_the_side_wall(degrees):
     places = outline(-1.2, 0.8, 300)
     points = facing(places, np.tan(np.radians(degrees)) * (places[:, 1] - 1))
+    leaning = plane_through(points)
+    (found,) = along_frame(CAMERAS, edges_of(points), leaning[None], ROOM)
+    assert abs(leaning[0]) > 1e-5 and abs(found[0]) < 1e-9
+    np.testing.assert_allclose(found, leaning, atol=0.004)
+
+
+def test_a_surface_that_leans_in_all_directions_is_not_turned():
+    places = outline(-1.2, 0.8, 300)
+    points = facing(places, np.tan(np.radians(20)) * (places[:, 0] + places[:, 1] - 1))
     leaning = plane_through(points)
     assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_plane_that_would_lose_its_points_is_not_turned():
-    """Two posts on a plane at 18 degrees to the room."""
+    """Two posts on a plane at 18 degrees to the side wall and at a right angle to the floor."""
     places = np.repeat([[-1.0, 0.0], [1.0, 0.0]], 60, axis=0)
     places[:, 1] = np.tile(np.linspace(0.2, 1.8, 60), 2)
     points = facing(places, np.tan(np.radians(18)) * places[:, 0], noise=0.0)
     leaning = plane_through(points)
-    assert (along_frame(CAMERAS, edges_of(points), leaning[None], ROOM) == leaning).all()
+    np.testing.assert_allclose(along_frame(CAMERAS, edges_of(points), leaning[None], ROOM), [leaning], atol=1e-9)
 
 
 def test_duplicates_are_merged_after_turning():
@@ -89,13 +99,6 @@ def test_duplicates_are_merged_after_turning():
     regions = edges_of(door) + edges_of(wall)
     found = along_frame(CAMERAS, regions, np.array([*sides, plane_through(wall)]), ROOM)
     np.testing.assert_allclose(found, [[0, 1, 0, 0], [0, 1, 0, -0.3]], atol=0.002)
-
-
-def test_no_plane_is_turned_without_a_frame():
-    points = facing(outline(-1.2, 0.0, 300), 0.0)
-    planes = np.array([[0.01, np.sqrt(1 - 1e-4), 0.0, 0.0]])
-    for by_points in (ROOM[:1], np.zeros((0, 4))):
-        assert along_frame(CAMERAS, edges_of(points), planes, by_points) is planes
 
 
 def leaning_skirtings(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
@@ -117,7 +120,7 @@ def test_planes_that_lean_differently_agree_after_turning_along_the_frame():
     assert not len(common_planes(cameras, regions))
     (plane,) = planes_by_edges(cameras, regions, ROOM)
     np.testing.assert_allclose(np.abs(plane), [0, 1, 0, 0], atol=0.003)
-    assert not len(planes_by_edges(cameras, regions, ROOM[:1]))  # no frame
+    assert not len(planes_by_edges(cameras, regions, None))
 
 
 def test_views_2_degrees_apart_count_as_one():

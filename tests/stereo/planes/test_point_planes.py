@@ -9,8 +9,11 @@ import pytest
 from helpers.captures import look_at
 
 from linprim_geo.stereo.depth_maps import DepthMap
+from linprim_geo.stereo.planes import point_planes
+from linprim_geo.stereo.planes.framed_planes import framed_planes_of_points
 from linprim_geo.stereo.planes.plain_regions import in_camera
-from linprim_geo.stereo.planes.point_planes import planes_of_points, point_plane_depth
+from linprim_geo.stereo.planes.point_planes import confirmed_points, planes_of_points, point_plane_depth
+from linprim_geo.stereo.planes.right_angles import angles_to
 
 WALL, FLOOR = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0, -0.6])
 CENTERS = [(x, 2.0, 0.3) for x in (-0.6, -0.3, 0.0, 0.3, 0.6)]
@@ -33,27 +36,33 @@ def map_of(camera, depth: np.ndarray, normal: np.ndarray, rng: np.random.Generat
     )
 
 
-def corner(centers=CENTERS, seed: int = 0) -> tuple[list[DepthMap], list[np.ndarray]]:
-    """Maps of a wall y = 0 and a floor z = -0.6 in front of it, and the true depths."""
+def corner(centers=CENTERS, seed: int = 0, others=()) -> tuple[list[DepthMap], list[np.ndarray]]:
+    """Maps of a wall y = 0, a floor z = -0.6 in front of it and `others` (K, 4), and the true depths."""
     rng, maps, depths = np.random.default_rng(seed), [], []
+    planes = np.array([WALL, FLOOR, *others])
     for center in centers:
         camera = look_at(center, target=(0.0, 0.0, 0.0), size=(96, 72), focal=80.0)
-        inverse = camera.ray_grid() @ in_camera(camera, np.array([WALL, FLOOR])).T
-        normal = np.array([WALL[:3], FLOOR[:3]])[inverse.argmax(-1)]
+        inverse = camera.ray_grid() @ in_camera(camera, planes).T
+        normal = planes[inverse.argmax(-1), :3]
         depths.append(1 / inverse.max(-1))
         maps.append(map_of(camera, depths[-1], normal, rng))
     return maps, depths
 
 
+def planes_in(maps: list[DepthMap], depths: list[np.ndarray] | None = None) -> np.ndarray:
+    """The planes of the points of maps, or of other depths of the same views."""
+    return planes_of_points(*confirmed_points(maps, depths or [found.depth for found in maps]))[0]
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_wall_and_a_floor_are_found(seed):
     maps, depths = corner(seed=seed)
-    planes = planes_of_points(maps, [found.depth for found in maps])
+    planes = planes_in(maps)
     assert len(planes) == 2
     for plane in (WALL, FLOOR):
         # Thousands of points with a noise of 6 mm at 2 m.
         assert min(np.abs(found * np.sign(found[:3] @ plane[:3]) - plane).max() for found in planes) < 2e-3
-    again = planes_of_points(maps, [found.depth for found in maps])
+    again = planes_in(maps)
     assert (planes == again).all()
 
 
@@ -76,19 +85,55 @@ def test_a_plane_does_not_lie_across_two_surfaces(seed):
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         noisy = np.where(known, noisy, np.nan)
         maps.append(replace(found, depth=noisy.astype(np.float32), normal=normal.astype(np.float32)))
-    planes = planes_of_points(maps, [found.depth for found in maps])
+    planes = planes_in(maps)
     planes *= np.sign(planes[:, [1]])
     assert np.degrees(np.arccos(planes[:, 1].min())) < 0.3
     offsets = np.sort(planes[:, 3])
     assert np.abs(offsets[[0, -1]] - [0.0, 0.04]).max() < 3e-3
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_plane_across_two_surfaces_gives_its_points_to_those_of_the_surfaces(monkeypatch, seed):
+    """The search has found a plane at 3 degrees to a wall first, and planes of the wall and the floor that err by 1."""
+    maps, _ = corner(seed=seed)
+    angle = np.radians([3, 1, 1])
+    found = np.array([[0, np.cos(angle[0]), np.sin(angle[0]), 0], [0, np.cos(angle[1]), -np.sin(angle[1]), 0.0], FLOOR])
+    found[2, :3] = [0, np.sin(angle[2]), np.cos(angle[2])]
+    monkeypatch.setattr(point_planes, "_found_in_turn", lambda *_: found)
+    planes, weight = planes_of_points(*confirmed_points(maps, [each.depth for each in maps]))
+    assert len(planes) == 2 and weight.min() > 1000
+    for plane in (WALL, FLOOR):
+        assert min(np.abs(each * np.sign(each[:3] @ plane[:3]) - plane).max() for each in planes) < 2e-3
+
+
+def test_a_roof_is_set_at_a_right_angle_to_the_gable():
+    """The slope, at 38 degrees, stands on the wall. The frame is that of the wall and the floor."""
+    slope = np.array([0.0, -np.sin(np.radians(38)), np.cos(np.radians(38)), 0.2])
+    maps, _ = corner(others=[slope])
+    planes, frame = framed_planes_of_points(maps, [found.depth for found in maps])
+    assert frame is not None and len(planes) == 3
+    assert np.degrees(angles_to(frame, np.eye(3))).max() < 0.1
+    for plane in (WALL, FLOOR, slope):
+        nearest = min(planes, key=lambda each: np.abs(each * np.sign(each[:3] @ plane[:3]) - plane).max())
+        np.testing.assert_allclose(nearest * np.sign(nearest[:3] @ plane[:3]), plane, atol=2e-3)
+        along = np.sort(np.abs(frame @ nearest[:3]))
+        assert along[0] < 1e-9 and (along[1] < 1e-9 or plane is slope)
+
+
+def test_planes_without_a_right_angle_have_no_frame():
+    slope = np.array([0.0, np.cos(np.radians(30)), np.sin(np.radians(30)), 0.0])
+    maps, _ = corner(others=[slope])
+    known = [np.where(found.normal[..., 2] < 0.9, found.depth, np.nan).astype(np.float32) for found in maps]
+    planes, frame = framed_planes_of_points(maps, known)
+    assert len(planes) == 2 and frame is None
+
+
 def test_two_views_or_no_depths_give_no_plane():
     for views in (1, 2):
         maps, _ = corner(CENTERS[:views])
-        assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
+        assert len(planes_in(maps)) == 0
     nothing = [np.full(found.depth.shape, np.nan, np.float32) for found in maps]
-    assert planes_of_points(maps, nothing).shape == (0, 4)
+    assert planes_in(maps, nothing).shape == (0, 4)
 
 
 def test_a_ball_gives_no_plane():
@@ -101,7 +146,7 @@ def test_a_ball_gives_no_plane():
         depth = (along - np.sqrt(np.maximum(inside, 0))) / (rays**2).sum(-1)
         normal = (camera.center + rays * depth[..., None]) / 0.5
         maps.append(map_of(camera, depth, normal, rng, inside > 0))
-    assert len(planes_of_points(maps, [found.depth for found in maps])) == 0
+    assert len(planes_in(maps)) == 0
 
 
 def test_depths_within_their_deviation_are_moved_to_the_plane():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from linprim_geo.stereo.planes.right_angles import angles_to, frame_of, orthogonalised
+from linprim_geo.stereo.planes.right_angles import angles_to, frame_of, off_frame, orthogonalised
 
 
 def turned(normal, degrees, axis, distance=1.0) -> np.ndarray:
@@ -76,6 +76,24 @@ def test_the_frame_of_a_room_follows_most_planes():
         assert np.degrees(angles_to(frame, np.eye(3))).max() < 0.4
     assert frame_of(np.array([FLOOR, turned([0, 0, 1], 8, [0, 1, 0])])[:, :3]) is None
     assert frame_of(np.zeros((0, 3))) is None
+
+
+def test_planes_count_for_the_frame_by_their_weight():
+    """Two slopes of a roof have a frame with the gable, and the floor and the ceiling have another one."""
+    gable, slopes = [1.0, 0, 0], [turned([0, 0.8, 0.6], 1, [1, 0, 0])[:3], turned([0, -0.6, 0.8], 2, [1, 0, 0])[:3]]
+    normals = np.array([gable, *slopes, [0, 0, 1.0], turned([0, 0, 1], 2, [0, 1, 0])[:3]])
+    by_slopes, by_floor = frame_of(normals, np.array([1, 1, 1, 0.1, 0.1])), frame_of(normals, np.array([1, 1, 1, 5, 1]))
+    assert by_slopes is not None and by_floor is not None
+    assert np.degrees(angles_to(by_slopes, np.array([[0, 0.8, 0.6]])))[0] < 2.1
+    assert np.degrees(angles_to(by_floor, np.eye(3))).max() < 0.1
+
+
+def test_angles_off_the_frame_are_those_to_an_axis_or_to_a_right_angle():
+    near, slope, oblique = turned([1, 0, 0], 5, [0, 1, 0]), [0.0, 0.6, 0.8], [0.48, 0.64, 0.6]
+    np.testing.assert_allclose(
+        np.degrees(off_frame(np.eye(3), np.array([near[:3], slope, oblique]))), [5, 0, np.degrees(np.arcsin(0.48))]
+    )
+    assert np.isinf(off_frame(None, np.eye(3))).all()
 
 
 @pytest.mark.parametrize("degrees", [3, 10])

@@ -15,6 +15,7 @@ from linprim_geo.stereo.planes import constrained_planes, plain_regions, shaded_
 from linprim_geo.stereo.planes.common_surfaces import SurfaceSupport
 from linprim_geo.stereo.planes.constrained_planes import ConstrainedPlanes
 from linprim_geo.stereo.planes.plain_regions import in_camera
+from linprim_geo.stereo.planes.right_angles import frame_of
 from linprim_geo.stereo.planes.shaded_planes import LEAST_VIEWS, OTHERS_SHARE, ShadedPlanes
 from linprim_geo.stereo.planes.shading import Shading, evaluate, fit_plane, shaded_regions
 from linprim_geo.stereo.planes.skies import shows_sky
@@ -28,7 +29,7 @@ def planes_of(maps, depths, by_points=NO_PLANES, by_edges=NO_PLANES, confirmed=N
     width = depths[0].shape[1]
     rendered = [(depth * np.linspace(0.86, 0.94, width)).astype(np.float32) for depth in depths]
     confirmed = confirmed or [np.full(depth.shape, np.nan, np.float32) for depth in depths]
-    return ShadedPlanes(maps, confirmed, rendered, by_points, by_edges)
+    return ShadedPlanes(maps, confirmed, rendered, by_points, by_edges, frame_of(by_points[:, :3]))
 
 
 def in_the_middle(depth) -> np.ndarray:
@@ -157,9 +158,11 @@ def test_a_plane_of_edges_near_a_point_plane_is_replaced_by_it():
     by_points = np.array([tilted(0.1)])
     found = planes_of(maps, depths, by_points, by_edges=-np.array([tilted(-0.4)]))
     np.testing.assert_array_equal(found.planes, [by_points[0], -by_points[0]])
-    # Planes that differ by more than the uncertainty of depths stay separate.
-    found = planes_of(maps, depths, by_points, by_edges=np.array([tilted(0) + [0, 0, 0, 0.1]]))
-    assert (found.planes[1] != by_points[0]).any()
+    # Planes that differ by more than the uncertainty of depths stay separate, and so do those that differ by more than
+    # the angle that this is at their sides.
+    for by_edges in (tilted(0) + [0, 0, 0, 0.1], tilted(1.5)):
+        found = planes_of(maps, depths, by_points, by_edges=by_edges[None])
+        assert (found.planes[1] != by_points[0]).any()
 
 
 def test_a_wall_is_found_under_different_exposures():
