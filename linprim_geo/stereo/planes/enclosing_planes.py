@@ -233,8 +233,8 @@ class ScenePoints:
 
     def closing(self, found: Sequence[np.ndarray], every: ScenePoints) -> list[np.ndarray]:
         """Return planes at right angles to two of those `found` where both end, also by the points of `every`, on sides
-        without a plane."""
-        closing: list[np.ndarray] = []
+        without a plane. Points are scarce beside an end, so of several planes on one side the farthest errs least."""
+        candidates, closing = list[np.ndarray](), list[np.ndarray]()
         for number, first in enumerate(found):
             for second in (other for other in found[:number] if at_right_angles(first, other)):
                 across = np.cross(first[:3], second[:3])
@@ -243,13 +243,16 @@ class ScenePoints:
                 apart = MARGIN * min(np.median(self.distance[own]) for own in sides)
                 for normal in (across, -across):
                     ends = [np.quantile(self.points.position[own] @ normal, OUTLIERS) for own in sides]
-                    there = any(normal @ other[:3] > SAME_NORMAL for other in (*found, *closing))
+                    there = any(normal @ other[:3] > SAME_NORMAL for other in found)
                     plane = np.append(normal, np.mean(ends))
                     if there or abs(ends[0] - ends[1]) > ENDS_APART * apart or not every.is_before_all(plane):
                         continue
                     ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
                     if ending and all(self.ends_in_images(own, plane, apart) for own in sides):
-                        closing.append(plane)
+                        candidates.append(plane)
+        for plane in sorted(candidates, key=lambda plane: plane[3]):
+            if not any(plane[:3] @ other[:3] > SAME_NORMAL for other in closing):
+                closing.append(plane)
         return closing
 
     def ends_at(self, plane: np.ndarray, end: np.ndarray, near: float) -> bool:

@@ -237,6 +237,21 @@ def test_ends_match_within_their_combined_margins(gap, apart, closes):
     assert [plane.closes for plane in found] == [False, False, True][: 2 + closes]
 
 
+def test_of_two_ends_the_farther_one_counts():
+    """Points of the floor and of the wall at y = 0 are missing up to 6 and 4 cm from the corner. A shelf on this wall
+    has points up to it."""
+    points = points_of(room(lambda place: np.abs(place[..., 0]) < 1e-6))
+    on_floor = np.abs(points.position[:, 2]) < 1e-6
+    points = points[points.position[:, 0] > np.where(on_floor, 0.06, 0.04)]
+    x, y = (each.ravel() for each in np.meshgrid(np.linspace(0, 0.5, 60), np.linspace(0, 0.3, 40)))
+    up, center = np.broadcast_to([0.0, 0, 1], (len(x), 3)), np.broadcast_to(CAMERAS[0].center, (len(x), 3))
+    shelf = SurfacePoints(np.column_stack([x, y, np.full(len(x), 0.5)]), up, center, np.zeros(len(x), int))
+    seen = ScenePoints(CAMERAS, SurfacePoints.together([points, shelf]))
+    for found in ([FLOOR, WALL, FLOOR + [0, 0, 0, 0.5]], [WALL, FLOOR + [0, 0, 0, 0.5], FLOOR]):
+        (side,) = seen.closing(found, seen)
+        assert side[0] > 0.99 and 0.015 < side[3] < 0.03
+
+
 def test_no_wall_is_placed_in_front_of_known_points():
     """Stereo has points of floor and wall up to 0.3 m from the corner, planes of plain regions give the others."""
     planes, seen = np.array([FLOOR, WALL]), points_of(room(lambda place: place[..., 0] < 0.3))
