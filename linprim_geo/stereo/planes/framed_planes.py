@@ -34,7 +34,7 @@ from linprim_geo.stereo.planes.point_planes import closeness, confirmed_points, 
 from linprim_geo.stereo.planes.right_angles import MOST_ANGLE_ERROR, NEARLY, angles_to, frame_of
 
 # A plane is turned only if it keeps more than this share of its points within half of TOLERANCE, or of their closeness.
-# Truly leaning planes, such as a sloping street, keep fewer (DECISIONS 141).
+# Truly leaning planes, such as a sloping street, keep fewer (DECISIONS 141, 155).
 KEPT_SHARE = 0.75
 # Two of the views that find a plane along the frame have to look from directions that differ by this angle in radians:
 # less than usual, as its normal is known.
