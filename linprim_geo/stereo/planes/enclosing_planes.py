@@ -233,7 +233,8 @@ class ScenePoints:
 
     def closing(self, found: Sequence[np.ndarray], every: ScenePoints) -> list[np.ndarray]:
         """Return planes at right angles to two of those `found` where both end, also by the points of `every`, on sides
-        without a plane. Points are scarce beside an end, so of several planes on one side the farthest errs least."""
+        without a plane. Points are scarce beside an end, so of several planes on one side the farthest from the cameras
+        errs least."""
         candidates, closing = list[np.ndarray](), list[np.ndarray]()
         for number, first in enumerate(found):
             for second in (other for other in found[:number] if at_right_angles(first, other)):
@@ -250,7 +251,8 @@ class ScenePoints:
                     ending = all(every.ends_at(wall, plane, apart) for wall in (first, second))
                     if ending and all(self.ends_in_images(own, plane, apart) for own in sides):
                         candidates.append(plane)
-        for plane in sorted(candidates, key=lambda plane: plane[3]):
+        middle = self.centers.mean(0)  # planes that are not quite parallel are compared there, not at the origin
+        for plane in sorted(candidates, key=lambda plane: plane[3] - plane[:3] @ middle):
             if not any(plane[:3] @ other[:3] > SAME_NORMAL for other in closing):
                 closing.append(plane)
         return closing

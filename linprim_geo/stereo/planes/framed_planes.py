@@ -30,7 +30,7 @@ from linprim_geo.stereo.planes.plain_regions import (
     may_lie_on,
     to_world,
 )
-from linprim_geo.stereo.planes.point_planes import closeness, confirmed_points, planes_of_points, shifted_to
+from linprim_geo.stereo.planes.point_planes import closeness, confirmed_points, planes_of_points, with_normal
 from linprim_geo.stereo.planes.right_angles import MOST_ANGLE_ERROR, NEARLY, angles_to, frame_of
 
 # A plane is turned only if it keeps more than this share of its points within half of TOLERANCE, or of their closeness.
@@ -56,7 +56,7 @@ def framed_planes_of_points(
     for k, plane in enumerate(planes):
         mine = points[own == k]
         for normal in _normals_in(frame, plane, NEARLY):
-            turned = shifted_to(mine, normal, plane)
+            turned = with_normal(mine, plane, normal)
             before, after = (closeness(mine.residuals(each[None])).sum() for each in (plane, turned))
             if after > KEPT_SHARE * before:
                 planes[k] = turned

@@ -142,18 +142,18 @@ def closeness(residuals: np.ndarray) -> np.ndarray:
     return np.mean([np.maximum(0, 1 - (residuals / part) ** 2) ** 2 for part in TOLERANCES], axis=0)
 
 
-def shifted_to(points: SurfacePoints, normal: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Return a plane (4,) with another `normal` (3,), where the points that were near the plane are closest."""
+def with_normal(points: SurfacePoints, plane: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Return a plane (4,) with another `normal` (3,), at the place where the points near it before are closest."""
     near = points[points.residuals(plane[None])[:, 0] < BEHIND * TOLERANCE]
     along = near.position @ normal
     towards = np.abs(along - near.center @ normal)
-    shifted = np.append(normal, np.median(along))
+    turned = np.append(normal, np.median(along))
     for _ in range(ROUNDS):
-        weight = _weights(near.residuals(shifted[None])[:, 0]) / np.maximum(towards, 1e-12) ** 2
+        weight = _weights(near.residuals(turned[None])[:, 0]) / np.maximum(towards, 1e-12) ** 2
         if not weight.any():
             break
-        shifted[3] = np.average(along, weights=weight)
-    return shifted
+        turned[3] = np.average(along, weights=weight)
+    return turned
 
 
 def _found_in_turn(points: SurfacePoints, least: float, rng: np.random.Generator) -> np.ndarray:

@@ -380,7 +380,8 @@ class ShadedPlanes:
         return by_edges if max(first, second) < self.given_count else ALIKE_DEPTH
 
     def _same(self, first: int, second: int, regions: Sequence[ShadedRegion], tolerance: float) -> bool:
-        """Return whether two planes have nearly the same normal and, over the regions, median inverse depth."""
+        """Return whether two planes have nearly the same normal and, over the regions, median inverse depth up to a
+        `tolerance`. Planes known to TOLERANCE are also known to TOLERANCE_ANGLE, others to ALIKE_ANGLE."""
         planes, most_angle = self.planes[[first, second]], TOLERANCE_ANGLE if tolerance == TOLERANCE else ALIKE_ANGLE
         if not regions or abs(planes[0, :3] @ planes[1, :3]) < np.cos(most_angle):
             return False

@@ -48,7 +48,8 @@ def shows_sky(maps: Sequence[DepthMap]) -> list[bool]:
     sure = [np.where(found.is_confirmed(SURE), found.depth, np.float32(np.nan)) for found in maps]
     regions = [region for own in regions_of_views(maps, sure) for region in own]
     nothing = [np.zeros_like(depth) for depth in sure]
-    (by_points, weight), by_edges = planes_of_points(*confirmed_points(maps, sure)), common_planes(cameras, regions)
+    by_points, weight = planes_of_points(*confirmed_points(maps, sure))
+    by_edges = common_planes(cameras, regions)
     shaded = ShadedPlanes(maps, sure, nothing, by_points, by_edges, frame_of(by_points[:, :3], weight))
     planes, result = shaded.planes[shaded.by_points :], []
     for view, (shading, known) in enumerate(zip(shaded.shadings, shaded.depths, strict=True)):

@@ -247,9 +247,22 @@ def test_of_two_ends_the_farther_one_counts():
     up, center = np.broadcast_to([0.0, 0, 1], (len(x), 3)), np.broadcast_to(CAMERAS[0].center, (len(x), 3))
     shelf = SurfacePoints(np.column_stack([x, y, np.full(len(x), 0.5)]), up, center, np.zeros(len(x), int))
     seen = ScenePoints(CAMERAS, SurfacePoints.together([points, shelf]))
-    for found in ([FLOOR, WALL, FLOOR + [0, 0, 0, 0.5]], [WALL, FLOOR + [0, 0, 0, 0.5], FLOOR]):
-        (side,) = seen.closing(found, seen)
-        assert side[0] > 0.99 and 0.015 < side[3] < 0.03
+    tilted = np.array([np.sin(0.008), 0.0, np.cos(0.008), 0.0])
+    for floor in (FLOOR, tilted, tilted * [-1, 1, 1, 1]):
+        for found in ([floor, WALL, FLOOR + [0, 0, 0, 0.5]], [WALL, FLOOR + [0, 0, 0, 0.5], floor]):
+            for up in (0.0, -100.0, 100.0):  # wherever the origin is
+                (side,) = moved_up(seen, up).closing(
+                    [each + [0, 0, 0, up * each[2]] for each in found], moved_up(seen, up)
+                )
+                assert side[0] > 0.99 and 0.015 < side[3] - up * side[2] < 0.03
+
+
+def moved_up(seen: ScenePoints, up: float) -> ScenePoints:
+    """The same points and cameras, moved along z."""
+    back, by, points = np.eye(4), np.array([0.0, 0.0, up]), seen.points
+    back[2, 3] = -up
+    moved = SurfacePoints(points.position + by, points.normal, points.center + by, points.view)
+    return ScenePoints([replace(one, world_to_camera=one.world_to_camera @ back) for one in seen.cameras], moved)
 
 
 def test_no_wall_is_placed_in_front_of_known_points():

@@ -101,6 +101,16 @@ def test_duplicates_are_merged_after_turning():
     np.testing.assert_allclose(found, [[0, 1, 0, 0], [0, 1, 0, -0.3]], atol=0.002)
 
 
+def test_no_plane_is_turned_without_a_frame():
+    places = outline(-1.2, 0.8, 300)
+    points = facing(places, np.tan(np.radians(0.5)) * places[:, 0], noise=0.001)
+    regions = edges_of(points)
+    planes = common_planes(CAMERAS, regions)
+    assert len(planes) == 1 and abs(planes[0, 0]) > 0.005
+    assert (planes_by_edges(CAMERAS, regions, None) == planes).all()
+    assert np.abs(planes_by_edges(CAMERAS, regions, ROOM)[:, 0]).max() < 1e-9
+
+
 def leaning_skirtings(apart: float) -> tuple[list[Camera], list[PlainRegion]]:
     """Cameras `apart` from each other, and a region of the wall y = 0 in each: points at its corner are exact, those
     of the skirting lean by 9 degrees to alternating sides."""
